@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Fixtures of all suites: a ROS master per test module, a bridge on it, clients that are closed at the end.
+
+A test fails when a server logged an error or a traceback that the test did not expect; a test that provokes
+one says so with `@pytest.mark.allow_log("pattern", …)`. The output of every process is shown with a failure.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any, Callable, Iterator, List
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent
+SHOWN_BYTES = 6000
+
+
+def _make_importable() -> None:
+    """`support`, and the built packages unless the devel space was sourced already."""
+    sys.path.insert(0, str(ROOT / "test"))
+    try:
+        import rosbridge_msgs.msg  # noqa: F401
+    except ImportError:
+        sys.path[1:1] = [
+            str(path) for path in (ROOT / "build" / "devel" / "lib").glob("python3*/dist-packages")
+        ]
+
+
+_make_importable()
+
+from support import bridge as bridges  # noqa: E402
+from support import process as processes  # noqa: E402
+from support.bridge import Bridge  # noqa: E402
+from support.client import Client  # noqa: E402
+from support.ros import RosMaster  # noqa: E402
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line(
+        "markers", "allow_log(*patterns): regular expressions of errors that the server may log in this test"
+    )
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Iterator[None]:
+    outcome: Any = yield
+    report = outcome.get_result()
+    if report.failed:
+        for process in processes.started:
+            shown = process.output[-SHOWN_BYTES:]
+            if shown:
+                report.sections.append((f"output of {process.name} ({process.log_path})", shown))
+
+
+@pytest.fixture(scope="module")
+def ros_master(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RosMaster]:
+    """A master for this module; it is empty when the module begins."""
+    del processes.started[:]  # of modules before
+    with RosMaster(tmp_path_factory.mktemp("ros")) as master:
+        yield master
+
+
+@pytest.fixture(scope="module")
+def bridge(ros_master: RosMaster, request: pytest.FixtureRequest) -> Iterator[Bridge]:
+    """A server with the default parameters, without rosapi, for this module."""
+    with Bridge(ros_master) as server:
+        yield server
+        server.stop()
+        _fail_on(server.unexpected(_allowed(request.node)))
+
+
+@pytest.fixture
+def start_bridge(ros_master: RosMaster, request: pytest.FixtureRequest) -> Iterator[Callable[..., Bridge]]:
+    """Starts servers for one test, with the arguments of `Bridge` after its first; a second one at a time
+    needs a `name`."""
+    servers: List[Bridge] = []
+
+    def start(*arguments: Any, **options: Any) -> Bridge:
+        servers.append(Bridge(ros_master, *arguments, **options))
+        return servers[-1]
+
+    yield start
+    for server in servers:
+        server.stop()
+    _fail_on([line for server in servers for line in server.unexpected(_allowed(request.node))])
+
+
+@pytest.fixture
+def connect() -> Iterator[Callable[..., Client]]:
+    """`connect(bridge, …)`: a new client of that server, closed when the test ends; options are those of
+    `Client`."""
+    clients: List[Client] = []
+
+    def new(server: Bridge, **options: Any) -> Client:
+        clients.append(server.connect(**options))
+        return clients[-1]
+
+    yield new
+    for client in clients:
+        client.close()
+
+
+@pytest.fixture
+def nodes() -> Iterator[Callable[[Any], Any]]:
+    """`nodes(publish(…))`: the node (or anything else with `stop()`), stopped when the test ends."""
+    started: List[Any] = []
+
+    def keep(node: Any) -> Any:
+        started.append(node)
+        return node
+
+    yield keep
+    for node in reversed(started):
+        node.stop()
+
+
+@pytest.fixture(autouse=True)
+def _no_unexpected_errors(request: pytest.FixtureRequest) -> Iterator[None]:
+    yield
+    allowed = _allowed(request.node)
+    _fail_on([line for server in bridges.running for line in server.unexpected(allowed)])
+
+
+def _allowed(node: pytest.Item) -> List[str]:
+    return [str(pattern) for marker in node.iter_markers("allow_log") for pattern in marker.args]
+
+
+def _fail_on(lines: List[str]) -> None:
+    if lines:
+        pytest.fail("unexpected in the log of a server:\n" + "\n".join(lines), pytrace=False)
