@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """What travels between a protocol and a client's connection.
 
-A protocol hands encoded messages (:class:`Payload`) to an :class:`Outbox`, which owns everything that waits for one
-client: it decides what goes out next and what is dropped when the client is slow. Topic messages are offered
-unencoded with their :class:`Source`, so that a message which is dropped is never encoded. A payload may be shared by
-all the clients that want it: its transport framing is made once too.
+A protocol hands encoded messages (:class:`Payload`) to an :class:`Outbox`, which owns everything that waits
+for one client: it decides what goes out next and what is dropped when the client is slow. Topic messages are
+offered unencoded with their :class:`Source`, so that a message which is dropped is never encoded. A payload
+may be shared by all the clients that want it: its transport framing is made once too.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ from __future__ import annotations
 from typing import Callable, Dict, Optional, Protocol, Sequence, Tuple, Union
 
 Buffer = Union[bytes, bytearray, memoryview]
-"""Bytes that are not changed any more once they are in a payload (a memoryview must be of bytes, ``itemsize`` 1)."""
+"""Bytes that are not changed any more once they are in a payload (a memoryview must be of bytes, ``itemsize``
+1)."""
 
 Framer = Callable[["Payload"], Tuple[Buffer, ...]]
 """Puts a transport's framing around a payload: the buffers to write, one after the other."""
@@ -21,8 +22,8 @@ Framer = Callable[["Payload"], Tuple[Buffer, ...]]
 class Payload:
     """One encoded message, immutable, shared between clients.
 
-    ``parts`` are the buffers that follow each other (kept apart so that a large one is never copied), ``binary`` says
-    whether they go in a binary frame or are UTF-8 text, ``size`` is their length in bytes.
+    ``parts`` are the buffers that follow each other (kept apart so that a large one is never copied),
+    ``binary`` says whether they go in a binary frame or are UTF-8 text, ``size`` is their length in bytes.
     """
 
     __slots__ = ("parts", "binary", "size", "_data", "_frames")
@@ -44,7 +45,8 @@ class Payload:
         return data
 
     def framed(self, framer: Framer) -> Tuple[Buffer, ...]:
-        """The buffers that ``framer`` makes of this payload, made once per framer however many clients get them."""
+        """The buffers that ``framer`` makes of this payload, made once per framer however many clients get
+        them."""
         frames = self._frames
         if frames is None:
             frames = self._frames = {}
@@ -71,14 +73,15 @@ class Source(Protocol):
     def encode(self, message: object) -> Sequence[Payload]:
         """The payloads to send for an offered message: one, or several fragments of it, or none.
 
-        Called on the loop when the message's turn comes. It must not raise; a message that can't be encoded is
-        reported by the source and gives none.
+        Called on the loop when the message's turn comes. It must not raise; a message that can't be encoded
+        is reported by the source and gives none.
         """
         ...
 
 
 class Outbox(Protocol):
-    """Everything that waits to be sent to one client. All methods are called on the loop and return at once."""
+    """Everything that waits to be sent to one client. All methods are called on the loop and return at
+    once."""
 
     def send(self, payload: Payload) -> None:
         """Sends on the control lane: in order, never dropped, before any topic message that waits."""
