@@ -12,16 +12,16 @@ import re
 from typing import Any, Callable, Dict, List, Mapping, Sequence, Tuple
 from urllib.parse import urlsplit
 
-from rosbridge_library.access import Access
-from rosbridge_library.internal.exceptions import TypeLoadError
-from rosbridge_library.names import global_name
-from rosbridge_library.ros.master import MasterError
-
 from rosapi import typedefs
 from rosapi.graph import Graph, action_servers, fetch_graph, names_with
 from rosapi.params import Params
 from rosapi.recent import Recent
 from rosapi.service_types import ServiceTypes, Types
+from rosapi.xml_text import is_xml_text
+from rosbridge_library.access import Access
+from rosbridge_library.internal.exceptions import TypeLoadError
+from rosbridge_library.names import global_name
+from rosbridge_library.ros.master import MasterError
 
 MAX_AGE_S = 1.0
 """How old the master's state may be that an answer comes from."""
@@ -62,7 +62,7 @@ class Api:
         return {"topics": topics, "types": types}
 
     def topics_for_type(self, type: str) -> Response:
-        return {"topics": [topic for topic, kind in zip(*self._topics_and_types()) if kind == type]}
+        return {"topics": [topic for topic, kind in zip(*self._topics_and_types()) if type and kind == type]}
 
     def topics_and_raw_types(self) -> Response:
         topics, types = self._topics_and_types()
@@ -190,7 +190,7 @@ class Api:
     def _look_up(self, service: str) -> Tuple[str, str]:
         """The global name and the uri of a service; "" when there is none, or the globs close it."""
         name = global_name(service)
-        if not self._access.may_call(name):
+        if not self._access.may_call(name) or not is_xml_text(name):
             return name, ""
         try:
             return name, str(self._call("lookupService", name))

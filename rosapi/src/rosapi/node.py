@@ -15,15 +15,15 @@ from functools import partial
 from typing import Any, Callable, Dict, Optional, TypeVar
 
 import rospy
-from rosbridge_library.access import Access
-from rosbridge_library.internal.exceptions import RosbridgeError
-from rosbridge_library.ros.master import Master, MasterUnreachable
-from rosbridge_library.ros.registrar import Registrar
 
 from rosapi import msg, srv
 from rosapi.api import Api, Response
 from rosapi.service_types import probe_types
 from rosapi.service_uris import look_up_services
+from rosbridge_library.access import Access
+from rosbridge_library.internal.exceptions import RosbridgeError
+from rosbridge_library.ros.master import Master, MasterUnreachable
+from rosbridge_library.ros.registrar import Registrar
 
 logger = logging.getLogger("rosbridge.rosapi")
 

@@ -15,10 +15,10 @@ import base64
 import datetime
 import json
 import math
-import re
 import xmlrpc.client
 from typing import Any, Callable, Iterable, Iterator, List, Optional
 
+from rosapi.xml_text import is_xml_text
 from rosbridge_library.access import Access
 from rosbridge_library.internal.exceptions import RosbridgeError
 from rosbridge_library.names import global_name
@@ -28,9 +28,6 @@ INT_LIMITS = (xmlrpc.client.MININT, xmlrpc.client.MAXINT)
 
 # Deeper than any real parameter, and far below what makes the master fail when it writes the value out.
 MAX_DEPTH = 64
-
-# What XML 1.0 has no way to write.
-_NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 class ParameterError(RosbridgeError):
@@ -95,7 +92,7 @@ def _check(value: Any, where: str, depth: int) -> None:
         raise ParameterError(
             f"the parameter server holds integers of 32 bits only, not {_shown(value)}{_at(where)}"
         )
-    elif isinstance(value, str) and _NOT_XML.search(value):
+    elif isinstance(value, str) and not is_xml_text(value):
         raise ParameterError(
             f"the parameter server can't hold control characters or half a surrogate pair{_at(where)}"
         )
@@ -160,7 +157,7 @@ class Params:
 
     def search(self, name: str) -> str:
         """The global name found by ROS's search for `name`, from rosapi's namespace upward, or ""."""
-        if not name.strip("/") or name.startswith("~") or _NOT_XML.search(name):
+        if not name.strip("/") or name.startswith("~") or not is_xml_text(name):
             return ""
         try:
             found = str(self._call("searchParam", name))
@@ -175,7 +172,7 @@ class Params:
     def _key(self, name: str) -> Optional[str]:
         """The global name, or None when no parameter can have it or the globs close it."""
         key = global_name(name)
-        usable = name and not _NOT_XML.search(name) and self._access.may_use_param(key)
+        usable = name and is_xml_text(name) and self._access.may_use_param(key)
         return key if usable else None
 
     def _visible(self, key: str, value: Any) -> Any:
@@ -212,7 +209,7 @@ def _default(text: str) -> str:
 
 
 def _checked_name(name: str) -> str:
-    if not name or _NOT_XML.search(name):
+    if not name or not is_xml_text(name):
         raise ParameterError(f"{name[:200]!a} can't name a parameter")
     return global_name(name)
 
