@@ -34,6 +34,7 @@ from support import bridge as bridges  # noqa: E402
 from support import process as processes  # noqa: E402
 from support.bridge import Bridge  # noqa: E402
 from support.client import Client  # noqa: E402
+from support.node import Node  # noqa: E402
 from support.ros import RosMaster  # noqa: E402
 
 
@@ -103,15 +104,17 @@ def connect() -> Iterator[Callable[..., Client]]:
 
 
 @pytest.fixture
-def nodes() -> Iterator[Callable[[Any], Any]]:
-    """`nodes(publish(…))`: the node (or anything else with `stop()`), stopped when the test ends."""
-    started: List[Any] = []
+def nodes() -> Iterator[Callable[[Node], Node]]:
+    """`nodes(publish(…))`: the node, stopped when the test ends."""
+    started: List[Node] = []
 
-    def keep(node: Any) -> Any:
+    def keep(node: Node) -> Node:
         started.append(node)
         return node
 
     yield keep
+    for node in reversed(started):
+        node.interrupt()  # all first: rospy takes its time to shut down
     for node in reversed(started):
         node.stop()
 

@@ -8,6 +8,7 @@ is an option; what they have to say is a JSON line on their output. `script` run
 from __future__ import annotations
 
 import json
+import signal
 from pathlib import Path
 from typing import Any, Dict, List, Optional, Sequence
 
@@ -32,6 +33,11 @@ class Node:
 
     def stop(self) -> None:
         self.process.stop()
+
+    def interrupt(self) -> None:
+        """Tells it to end, as Ctrl-C does, and does not wait."""
+        if self.process.alive:
+            self.process.signal(signal.SIGINT)
 
     def kill(self) -> None:
         """Ends it as a crash does: nothing is unregistered."""
@@ -127,7 +133,8 @@ def script(master: RosMaster, source: str, *, name: str = "script", arguments: S
     """A node that runs Python source with rospy imported and initialised; ready once it prints `{"ready":
     true}`, for which `ready()` is there, as is `say(**record)`."""
     path = master.directory / f"{name}.py"
-    path.write_text(f"from programs.program import *\nimport rospy\nrospy.init_node({name!r})\n{source}\n")
+    beginning = f"from programs.program import *\nimport rospy\nrospy.init_node({name!r})\n"
+    path.write_text(f"{beginning}{source}\nstay()\n")
     return _started(master, [str(path), *arguments], name)
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import roslib.message
 import rospy
 
-from programs.program import options, plain, ready, say
+from programs.program import options, plain, ready, say, stay
 
 
 def main() -> None:
@@ -15,7 +15,7 @@ def main() -> None:
     message_class = roslib.message.get_message_class(wanted["kind"])
     rospy.Subscriber(wanted["topic"], message_class, lambda message: say(message=plain(message)))
     ready()
-    rospy.spin()
+    stay()
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import sys
 import threading
+import time
 from typing import Any, Dict
 
 import genpy
@@ -29,6 +30,12 @@ def say(**record: Any) -> None:
 def ready() -> None:
     """Tells that all is registered."""
     say(ready=True)
+
+
+def stay() -> None:
+    """Returns when the node is shut down: rospy.spin(), but quicker to notice."""
+    while not rospy.is_shutdown():
+        time.sleep(0.02)
 
 
 def fill(message: Any, values: Dict[str, Any]) -> Any:

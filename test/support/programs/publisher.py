@@ -9,7 +9,7 @@ import time
 import roslib.message
 import rospy
 
-from programs.program import fill, options, ready, say
+from programs.program import fill, options, ready, say, stay
 
 
 def main() -> None:
@@ -32,7 +32,7 @@ def main() -> None:
         if wanted["rate"]:
             time.sleep(max(0.0, begin + (number + 1) / wanted["rate"] - time.monotonic()))
     say(done=wanted["count"])
-    rospy.spin()
+    stay()
 
 
 if __name__ == "__main__":

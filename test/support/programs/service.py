@@ -12,7 +12,7 @@ import rosgraph
 import roslib.message
 import rospy
 
-from programs.program import fill, options, plain, ready, say
+from programs.program import fill, options, plain, ready, say, stay
 
 
 def register_deaf(service: str) -> socket.socket:
@@ -48,7 +48,7 @@ def main() -> None:
     else:
         service = rospy.Service(wanted["service"], service_class, handle)
     ready()
-    rospy.spin()
+    stay()
     del service
 
 
