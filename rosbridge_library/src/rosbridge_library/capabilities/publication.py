@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""Which topics one client advertises: what the advertise and publish operations share.
+
+A topic can be advertised several times, each with an id of its own, and is advertised until all have been taken back.
+Publishing on a topic that was not advertised advertises it, if its type is known.
+"""
+
+from __future__ import annotations
+
+from typing import Dict, Hashable, Optional, Set
+
+from rosbridge_library.codec import MessageType, get_message_type
+from rosbridge_library.internal.exceptions import RosbridgeError
+from rosbridge_library.names import checked_global_name
+from rosbridge_library.protocol import Protocol
+from rosbridge_library.ros.master import MasterUnreachable
+from rosbridge_library.ros.node import Node, RosTimeout, TopicInfo
+from rosbridge_library.ros.publishers import DEFAULT_QUEUE_SIZE, Publisher
+
+
+class TopicConflict(RosbridgeError):
+    """A topic has another type, or none that is known."""
+
+
+class AccessDenied(RosbridgeError):
+    """The server's globs close this name to clients."""
+
+
+class Publications:
+    """The topics that one client publishes, by the name that it wrote."""
+
+    def __init__(self, protocol: Protocol) -> None:
+        self._protocol = protocol
+        self._publishers: Dict[str, Publisher] = {}
+        self._ids: Dict[str, Set[Hashable]] = {}
+
+    @property
+    def node(self) -> Node:
+        """The shared ROS side."""
+        return self._protocol.node
+
+    def get(self, topic: str) -> Optional[Publisher]:
+        """The publisher of `topic`, as the client wrote it, if the client advertises it."""
+        return self._publishers.get(topic)
+
+    async def advertise(
+        self,
+        topic: str,
+        type_name: Optional[str],
+        advertise_id: Hashable,
+        latch: bool,
+        queue_size: Optional[int],
+    ) -> Publisher:
+        """Advertise `topic`, of the type that it has when none is given.
+
+        Raises InvalidArgumentException for an illegal name, AccessDenied, TypeLoadError, TopicConflict, MasterError.
+        """
+        name = checked_global_name(topic, "topic")
+        if not self.node.access.may_publish(name):
+            raise AccessDenied(f"the server does not let clients publish {topic}")
+        name = self.node.resolve(name)
+        info = await self._look_up(name)
+        type_ = await self._type(name, type_name, info)
+        publisher = self.node.publishers.open(
+            name,
+            type_,
+            self._protocol,
+            latch,
+            DEFAULT_QUEUE_SIZE if queue_size is None else queue_size,
+            [] if info is None else info.subscribers,
+        )
+        self._publishers[topic] = publisher
+        self._ids.setdefault(topic, set()).add(advertise_id)
+        if info is not None:
+            await self.node.publishers.registered(publisher)
+        return publisher
+
+    async def _look_up(self, name: str) -> Optional[TopicInfo]:
+        """What the master says, or None, with the client told, while it is away."""
+        try:
+            return await self.node.topic(name)
+        except (MasterUnreachable, RosTimeout) as error:
+            self._protocol.log("error", f"{error}; {name} will be advertised when it is back")
+            return None
+
+    async def _type(self, name: str, type_name: Optional[str], info: Optional[TopicInfo]) -> MessageType:
+        ours = self.node.publishers.get(name)
+        if ours is not None and (ours.users or type_name is None):
+            if type_name is not None and ours.type.name != (await self._installed(type_name)).name:
+                raise TopicConflict(f"{name} is already advertised by clients as {ours.type.name}, not {type_name}")
+            return ours.type
+        present = info.type if info is not None and self._used_by_others(info) else ""
+        if type_name is None:
+            if not present:
+                raise TopicConflict(f"{name} does not exist, so it has no type: advertise it with one first")
+            return await self._installed(present)
+        type_ = await self._installed(type_name)
+        if present not in ("", type_.name):
+            users = ", ".join(info.publishers or info.subscribers) if info is not None else ""
+            raise TopicConflict(f"{name} already has type {present}, not {type_.name}; it is used by {users}")
+        return type_
+
+    async def _installed(self, type_name: str) -> MessageType:
+        return await self.node.call(get_message_type, type_name)
+
+    def _used_by_others(self, info: TopicInfo) -> bool:
+        return any(node != self.node.caller_id for node in info.publishers + info.subscribers)
+
+    def unadvertise(self, topic: str, advertise_id: Optional[Hashable]) -> bool:
+        """Take back one advertisement of `topic`, or all of them when no id is given. False: there was none."""
+        ids = self._ids.get(topic)
+        if ids is None or (advertise_id is not None and advertise_id not in ids):
+            return False
+        ids.discard(advertise_id)
+        if advertise_id is None or not ids:
+            del self._ids[topic]
+            self._leave(self._publishers.pop(topic))
+        return True
+
+    def _leave(self, publisher: Publisher) -> None:
+        # A client may have written one topic in two ways.
+        if publisher not in self._publishers.values():
+            self.node.publishers.leave(publisher, self._protocol)
+
+    def unadvertise_all(self) -> None:
+        """Take everything back: the client is gone."""
+        for topic in list(self._ids):
+            self.unadvertise(topic, None)
+
+
+def publications(protocol: Protocol) -> Publications:
+    """The publications of `protocol`, made when first asked for."""
+    found = protocol.shared.get("publications")
+    if found is None:
+        found = protocol.shared["publications"] = Publications(protocol)
+    assert isinstance(found, Publications)
+    return found

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""The bridge's ROS side, shared by all clients of every protocol.
+
+A `Node` belongs to one event loop, which owns all its state. Blocking ROS calls leave the loop through `Node.call`.
+Make it after rospy.init_node and `start` it: from then on topic connections are read and written on the loop (see
+`tcpros`), and registrations survive the master (see `registrar`).
+
+A program that uses the library's classes without a loop of its own (as programs written for rosbridge_library do)
+shares the node of `background_node`, whose loop runs in a thread.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import logging
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Callable, List, NamedTuple, Optional, Tuple, TypeVar
+
+import rospy
+import rospy.impl.tcpros
+import rospy.impl.tcpros_base
+from rospy.impl.registration import Registration, get_topic_manager
+
+from rosbridge_library.access import Access
+from rosbridge_library.internal.exceptions import RosbridgeError
+from rosbridge_library.ros.feeds import Feeds
+from rosbridge_library.ros.master import Master
+from rosbridge_library.ros.providers import ServiceProviders
+from rosbridge_library.ros.publishers import Publishers
+from rosbridge_library.ros.registrar import Registrar
+from rosbridge_library.ros.services import ServiceCaller
+from rosbridge_library.ros.tcpros import LoopTcprosHandler
+
+logger = logging.getLogger("rosbridge.node")
+
+CALL_THREADS = 16
+MASTER_TIMEOUT_S = 5.0
+DEFAULT_UNREGISTER_TIMEOUT_S = 10.0
+
+T = TypeVar("T")
+
+
+class RosTimeout(RosbridgeError):
+    """A blocking ROS call didn't end in time."""
+
+
+class TopicInfo(NamedTuple):
+    """What the master knows of a topic: its type ("" when unknown), and the nodes that publish and subscribe."""
+
+    type: str
+    publishers: List[str]
+    subscribers: List[str]
+
+
+class Node:
+    """Feeds, publishers, services and the master, for one process. All methods are for the loop's thread."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, access: Optional[Access] = None) -> None:
+        self.loop = loop
+        self.access = access or Access()
+        self.unregister_timeout_s = DEFAULT_UNREGISTER_TIMEOUT_S
+        self.caller_id: str = rospy.get_name()
+        self.master = Master(self.caller_id, timeout=MASTER_TIMEOUT_S)
+        self._threads = ThreadPoolExecutor(CALL_THREADS, thread_name_prefix="ros-call")
+        self._registrar = Registrar(self.master)
+        self._handler = LoopTcprosHandler(loop)
+        self.feeds = Feeds(loop, self._handler, self._registrar, self.now)
+        self.publishers = Publishers(loop, self._handler, self._registrar, lambda: self.unregister_timeout_s)
+        self.services = ServiceCaller(self.call, self.master, self.caller_id)
+        self.providers = ServiceProviders(self.call, self.master, self.caller_id)
+        self._topic_lookup: Optional[asyncio.Task[_Graph]] = None
+
+    async def start(self) -> None:
+        """Take rospy's place at the topic sockets and at the master. Raises RuntimeError before rospy.init_node."""
+        self._registrar.install()
+        rospy.impl.tcpros._handler = self._handler
+        rospy.impl.tcpros_base._tcpros_server.topic_connection_handler = self._handler.topic_connection_handler
+        self._registrar.rospy_registration.handler.protocol_handlers[:] = [self._handler]
+        # What rospy has subscribed so far (/clock) is read by its threads; connect it anew, on the loop.
+        for topic, subscriber in list(get_topic_manager().subs.items()):
+            for connection in list(subscriber.connections):
+                connection.close()
+            self._registrar.settled(Registration.SUB, topic)
+
+    async def stop(self) -> None:
+        """End every feed, publisher and provided service. Doesn't wait for the master."""
+        self.feeds.close_all()
+        self.publishers.close_all()
+        await self.providers.close()
+        await self.services.close()
+        self._registrar.close()
+        self._threads.shutdown(wait=False)
+
+    async def call(self, function: Callable[..., T], *args: Any, timeout: Optional[float] = MASTER_TIMEOUT_S) -> T:
+        """What the blocking `function(*args)` returns, run on the thread pool.
+
+        Raises RosTimeout after `timeout` seconds (the thread then goes on by itself, so `function` needs a deadline
+        of its own), and whatever `function` raises.
+        """
+        work = self.loop.run_in_executor(self._threads, functools.partial(function, *args))
+        try:
+            return await asyncio.wait_for(work, timeout)
+        except asyncio.TimeoutError:
+            name = getattr(function, "__name__", str(function))
+            raise RosTimeout(f"no answer to {name} within {timeout:g} s") from None
+
+    @staticmethod
+    def now() -> Tuple[int, int]:
+        """ROS time as seconds and nanoseconds: simulated time when /use_sim_time is set."""
+        time = rospy.get_rostime()
+        return time.secs, time.nsecs
+
+    def resolve(self, global_name: str) -> str:
+        """The name that ROS uses for a global name: another one where this node was started with a remapping."""
+        resolved: str = rospy.names.resolve_name(global_name)
+        return resolved
+
+    async def topic(self, topic: str) -> TopicInfo:
+        """What the master knows of `topic`, asked after this call. Raises MasterUnreachable or MasterError.
+
+        The master remembers the types of topics that are gone, so a topic that nobody publishes or subscribes has no
+        type here.
+        """
+        # One look serves all who asked before it began.
+        lookup = self._topic_lookup
+        if lookup is None:
+            lookup = self._topic_lookup = self.loop.create_task(self._look_up_topics())
+        graph = await asyncio.shield(lookup)
+        return graph.topic(topic)
+
+    async def _look_up_topics(self) -> _Graph:
+        await asyncio.sleep(0)  # whoever asks in this turn of the loop is served too
+        self._topic_lookup = None
+        return await self.call(self._ask_graph, timeout=2 * MASTER_TIMEOUT_S + 1)
+
+    def _ask_graph(self) -> _Graph:
+        publishers, subscribers, _ = self.master.call("getSystemState")
+        return _Graph(dict(publishers), dict(subscribers), dict(self.master.call("getTopicTypes")))
+
+
+class _Graph(NamedTuple):
+    publishers: Any
+    subscribers: Any
+    types: Any
+
+    def topic(self, topic: str) -> TopicInfo:
+        publishers, subscribers = self.publishers.get(topic, []), self.subscribers.get(topic, [])
+        type_ = self.types.get(topic, "") if publishers or subscribers else ""
+        return TopicInfo("" if type_ == "*" else type_, publishers, subscribers)
+
+
+class _Background:
+    """The loop and node of programs that have no loop."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()  # at the door: any thread may be the first to ask
+        self._node: Optional[Node] = None
+
+    def node(self) -> Node:
+        with self._lock:
+            if self._node is None:
+                loop = asyncio.new_event_loop()
+                threading.Thread(target=loop.run_forever, name="rosbridge-loop", daemon=True).start()
+                node = asyncio.run_coroutine_threadsafe(self._make(loop), loop).result()
+                self._node = node
+            return self._node
+
+    @staticmethod
+    async def _make(loop: asyncio.AbstractEventLoop) -> Node:
+        node = Node(loop)
+        await node.start()
+        return node
+
+
+background_node: Callable[[], Node] = _Background().node
+"""The node of a program without a loop of its own, made at the first call, from any thread."""
