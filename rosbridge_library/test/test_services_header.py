@@ -4,10 +4,13 @@
 from __future__ import annotations
 
 import struct
+from typing import Dict
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rosgraph.network import decode_ros_handshake_header, encode_ros_handshake_header
+
 from rosbridge_library.ros.tcpros_header import (
     MAX_HEADER_BYTES,
     HeaderError,
@@ -15,19 +18,18 @@ from rosbridge_library.ros.tcpros_header import (
     decode_length,
     encode_header,
 )
-from rosgraph.network import decode_ros_handshake_header, encode_ros_handshake_header
 
 keys = st.text("abcdefghijklmnopqrstuvwxyz0123456789_", min_size=1)
 fields = st.dictionaries(keys, st.text(st.characters(exclude_categories=("Cs",))))
 
 
 @given(fields)
-def test_ros_reads_what_is_encoded(header: "dict[str, str]") -> None:
+def test_ros_reads_what_is_encoded(header: Dict[str, str]) -> None:
     assert decode_ros_handshake_header(encode_header(header)) == header
 
 
 @given(fields)
-def test_reads_what_ros_encodes(header: "dict[str, str]") -> None:
+def test_reads_what_ros_encodes(header: Dict[str, str]) -> None:
     encoded = encode_ros_handshake_header(header)
     assert decode_length(encoded[:4]) == len(encoded) - 4
     assert decode_header(encoded[4:]) == header
@@ -43,7 +45,7 @@ def test_any_bytes_are_fields_or_an_error(body: bytes) -> None:
 
 
 @given(fields.filter(bool), st.data())
-def test_cut_off(header: "dict[str, str]", data: st.DataObject) -> None:
+def test_cut_off(header: Dict[str, str], data: st.DataObject) -> None:
     body = encode_header(header)[4:]
     ends = {0}
     for key, value in header.items():
@@ -88,6 +90,6 @@ def test_limit() -> None:
 
 
 @pytest.mark.parametrize("header", [{"": "value"}, {"a=b": "value"}, {"key": "\ud800"}])
-def test_what_can_not_be_encoded(header: "dict[str, str]") -> None:
+def test_what_can_not_be_encoded(header: Dict[str, str]) -> None:
     with pytest.raises(HeaderError):
         encode_header(header)

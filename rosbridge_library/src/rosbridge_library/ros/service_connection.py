@@ -86,9 +86,7 @@ class ServiceConnection:
                 raise ConnectionEnded("the connection was closed")
             self._buffer += chunk
             if len(self._buffer) < size:
-                await asyncio.sleep(
-                    0
-                )  # while bytes are there sock_recv does not wait: let others have their turn
+                await asyncio.sleep(0)  # while bytes are there sock_recv does not wait: let others have their turn
         data = bytes(memoryview(self._buffer)[:size])
         del self._buffer[:size]
         return data

@@ -53,10 +53,7 @@ async def probe_services(
         nodes.setdefault(uri, []).append(service)
     results: Dict[str, ProbeResult] = {}
     slots = asyncio.Semaphore(concurrency)
-    tasks = [
-        asyncio.ensure_future(_probe_node(uri, names, caller_id, slots, results))
-        for uri, names in nodes.items()
-    ]
+    tasks = [asyncio.ensure_future(_probe_node(uri, names, caller_id, slots, results)) for uri, names in nodes.items()]
     try:
         if tasks:
             done, _ = await asyncio.wait(tasks, timeout=timeout)
