@@ -41,7 +41,12 @@ BUILTIN_TYPES = frozenset(NUMBER_CODES) | frozenset(TIME_CODES) | {"string"}
 # Arrays of these are binary data: base64 in JSON, byte strings in CBOR, bytes in Python.
 BINARY_TYPES = frozenset({"uint8", "char"})
 CODE_SIZES: Mapping[str, int] = {"?": 1, "b": 1, "B": 1, "h": 2, "H": 2, "i": 4, "I": 4, "q": 8, "Q": 8, "f": 4, "d": 8}
-_INTEGER_RANGES: Mapping[str, Tuple[int, int]] = {
+# Struct code → NumPy type of the same bytes; bool as the byte it is, since any value but 0 is true.
+NUMPY_TYPES: Mapping[str, str] = {
+    "?": "u1", "b": "i1", "B": "u1", "h": "<i2", "H": "<u2", "i": "<i4", "I": "<u4", "q": "<i8", "Q": "<u8",
+    "f": "<f4", "d": "<f8",
+}  # fmt: skip
+INTEGER_RANGES: Mapping[str, Tuple[int, int]] = {
     "b": (-(2**7), 2**7 - 1),
     "B": (0, 2**8 - 1),
     "h": (-(2**15), 2**15 - 1),
@@ -54,7 +59,8 @@ _INTEGER_RANGES: Mapping[str, Tuple[int, int]] = {
 
 # Bounds on hostile definitions: a few lines of text can nest to billions of fields. Real types stay far below.
 MAX_LEAVES = 20_000
-MAX_NESTING = 48
+MAX_FIXED_BYTES = 2**26
+MAX_NESTING = 16
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
 _TYPE = re.compile(r"([A-Za-z][\w/]*)(\[(\d*)\])?\Z", re.ASCII)
@@ -94,7 +100,7 @@ class Field:
         """The type as a definition writes it: "float64[36]"."""
         if not self.is_array:
             return self.type
-        return "%s[%s]" % (self.type, "" if self.length is None else self.length)
+        return "{}[{}]".format(self.type, "" if self.length is None else self.length)
 
     @property
     def element_size(self) -> Optional[int]:
@@ -150,15 +156,15 @@ class Plan:
         return bool(self.fields) and is_header_field(self.fields[0]) and self.fields[0].name == "header"
 
 
+def is_header_plan(plan: Plan) -> bool:
+    """Whether a message type is std_msgs/Header, of the well-known layout."""
+    layout = [(field.name, field.declared_type) for field in plan.fields]
+    return plan.name == HEADER_TYPE and layout == [("seq", "uint32"), ("stamp", "time"), ("frame_id", "string")]
+
+
 def is_header_field(field: Field) -> bool:
-    """Whether a field is one std_msgs/Header of the well-known layout."""
-    return (
-        field.type == HEADER_TYPE
-        and not field.is_array
-        and field.message is not None
-        and [(f.name, f.declared_type) for f in field.message.fields]
-        == [("seq", "uint32"), ("stamp", "time"), ("frame_id", "string")]
-    )
+    """Whether a field is one std_msgs/Header."""
+    return not field.is_array and field.message is not None and is_header_plan(field.message)
 
 
 def parse_definition(name: str, definition: str) -> Plan:
@@ -179,7 +185,7 @@ def _split(name: str, definition: str) -> Dict[str, str]:
     for line in definition.replace("\r\n", "\n").split("\n"):
         if expect_name:
             if not line.startswith("MSG: "):
-                raise DefinitionError("Definition of %s: expected a line MSG: package/Type, not %r" % (name, line[:80]))
+                raise DefinitionError(f"Definition of {name}: expected a line MSG: package/Type, not {line[:80]!r}")
             current, lines = _canonical(line[5:].strip()), []
             expect_name = False
         elif line.startswith(SEPARATOR) and not line.strip("= "):
@@ -210,11 +216,11 @@ class _Parser:
         if known is not None:
             return known
         if name in self._open:
-            raise DefinitionError("Message type %s contains itself" % name)
+            raise DefinitionError(f"Message type {name} contains itself")
         if name not in self._sections:
-            raise DefinitionError("The definition of message type %s is missing" % name)
+            raise DefinitionError(f"The definition of message type {name} is missing")
         if len(self._open) > MAX_NESTING:
-            raise DefinitionError("Message type %s is nested too deeply" % name)
+            raise DefinitionError(f"Message type {name} is nested too deeply")
         self._open.add(name)
         fields: List[Field] = []
         constants: List[Constant] = []
@@ -235,12 +241,12 @@ class _Parser:
         words = code.split()
         match = _TYPE.match(words[0])
         if len(words) != 2 or match is None or _NAME.match(words[1]) is None:
-            raise DefinitionError("Message type %s: not a field: %r" % (owner, code[:80]))
+            raise DefinitionError(f"Message type {owner}: not a field: {code[:80]!r}")
         base, brackets, digits = match.groups()
         is_array = brackets is not None
         length = int(digits) if digits and len(digits) < 10 else None
         if digits and length is None:
-            raise DefinitionError("Message type %s: array too long: %r" % (owner, code[:80]))
+            raise DefinitionError(f"Message type {owner}: array too long: {code[:80]!r}")
         if base in BUILTIN_TYPES:
             return Field(words[1], base, is_array, length)
         message = self.plan(self._resolve(owner, base))
@@ -249,7 +255,7 @@ class _Parser:
     def _resolve(self, owner: str, base: str) -> str:
         if "/" in base:
             return _canonical(base)
-        local = "%s/%s" % (owner.split("/", 1)[0], base)
+        local = "{}/{}".format(owner.split("/", 1)[0], base)
         if base == "Header" and (local == HEADER_TYPE or local not in self._sections):
             return HEADER_TYPE
         return local
@@ -262,11 +268,11 @@ def _parse_constant(owner: str, line: str, code: str) -> Constant:
     words = left.split()
     text = text.strip()
     if len(words) != 2 or _NAME.match(words[1]) is None:
-        raise DefinitionError("Message type %s: not a constant: %r" % (owner, code[:80]))
+        raise DefinitionError(f"Message type {owner}: not a constant: {code[:80]!r}")
     try:
         value = _constant_value(type_name, text)
     except ValueError as error:
-        raise DefinitionError("Message type %s: constant %s: %s" % (owner, words[1], error)) from error
+        raise DefinitionError(f"Message type {owner}: constant {words[1]}: {error}") from error
     return Constant(type_name, words[1], text, value)
 
 
@@ -279,18 +285,18 @@ def _constant_value(type_name: str, text: str) -> Any:
         return text.lower() == "true" if text.lower() in ("true", "false") else bool(int(text))
     code = NUMBER_CODES.get(type_name)
     if code is None:
-        raise ValueError("%s is not the type of a constant" % type_name)
+        raise ValueError(f"{type_name} is not the type of a constant")
     value = int(text)
-    low, high = _INTEGER_RANGES[code]
+    low, high = INTEGER_RANGES[code]
     if not low <= value <= high:
-        raise ValueError("%d is out of the range of %s" % (value, type_name))
+        raise ValueError(f"{value} is out of the range of {type_name}")
     return value
 
 
 def _make_plan(name: str, fields: Sequence[Field], constants: Sequence[Constant]) -> Plan:
     names = [field.name for field in fields]
     if len(set(names)) != len(names):
-        raise DefinitionError("Message type %s: two fields of one name" % name)
+        raise DefinitionError(f"Message type {name}: two fields of one name")
     sizes = [field.size for field in fields]
     size: Optional[int] = 0
     for part in sizes:
@@ -298,8 +304,9 @@ def _make_plan(name: str, fields: Sequence[Field], constants: Sequence[Constant]
     leaves = sum(1 if field.message is None else field.message.leaves for field in fields)
     nesting = 1 + max((field.message.nesting for field in fields if field.message is not None), default=0)
     min_size = sum(field.min_size for field in fields)
-    if leaves > MAX_LEAVES or nesting > MAX_NESTING or min_size > 2**31:
-        raise DefinitionError("Message type %s is too big" % name)
+    longest = max((field.length or 0 for field in fields), default=0)
+    if leaves > MAX_LEAVES or nesting > MAX_NESTING or max(min_size, longest) > MAX_FIXED_BYTES:
+        raise DefinitionError(f"Message type {name} is too big")
     text = md5_text(fields, constants)
     md5sum = hashlib.md5(text.encode("utf-8", "surrogateescape")).hexdigest()
     return Plan(name, tuple(fields), tuple(constants), text, md5sum, size, min_size, leaves, nesting)
@@ -307,9 +314,9 @@ def _make_plan(name: str, fields: Sequence[Field], constants: Sequence[Constant]
 
 def md5_text(fields: Sequence[Field], constants: Sequence[Constant]) -> str:
     """The text that ROS hashes to identify a message type: constants first, nested types as their own hash."""
-    lines = ["%s %s=%s" % (constant.type, constant.name, constant.text) for constant in constants]
+    lines = [f"{constant.type} {constant.name}={constant.text}" for constant in constants]
     for field in fields:
-        lines.append("%s %s" % (field.message.md5sum if field.message else field.declared_type, field.name))
+        lines.append(f"{field.message.md5sum if field.message else field.declared_type} {field.name}")
     return "\n".join(lines).strip()
 
 

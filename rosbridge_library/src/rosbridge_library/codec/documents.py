@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import io
 import json
-from typing import Any, Callable, Dict, Mapping, NoReturn, Union
+from typing import Any, Dict, Mapping, NoReturn, Union
 
 import cbor2
 import numpy as np
@@ -31,12 +31,12 @@ def decode_json(data: Union[bytes, bytearray, memoryview, str]) -> Any:
         return orjson.loads(data)
     except ValueError as error:
         if not _may_have_bare_tokens(data):
-            raise DecodeError("Not JSON: %s" % error) from error
+            raise DecodeError(f"Not JSON: {error}") from error
     try:
         text = data if isinstance(data, str) else str(data, "utf-8")
         return json.loads(text, parse_int=_parse_int)
     except (ValueError, RecursionError) as error:
-        raise DecodeError("Not JSON: %s" % error) from error
+        raise DecodeError(f"Not JSON: {error}") from error
 
 
 def _may_have_bare_tokens(data: Union[bytes, bytearray, memoryview, str]) -> bool:
@@ -64,16 +64,29 @@ def _json_default(value: Any) -> Any:
         return pybase64.b64encode_as_string(value)
     if isinstance(value, (np.ndarray, np.generic)):
         return value.tolist()
-    raise TypeError("%s is not JSON serializable" % type(value).__name__)
+    raise TypeError(f"{type(value).__name__} is not JSON serializable")
 
 
-# RFC 8746: tag → NumPy type of the elements. 68 is uint8 "clamped", 76 is reserved.
-TYPED_ARRAYS: Mapping[int, str] = {
-    64: "u1", 65: ">u2", 66: ">u4", 67: ">u8", 68: "u1", 69: "<u2", 70: "<u4", 71: "<u8",
-    72: "i1", 73: ">i2", 74: ">i4", 75: ">i8", 77: "<i2", 78: "<i4", 79: "<i8",
-    80: ">f2", 81: ">f4", 82: ">f8", 84: "<f2", 85: "<f4", 86: "<f8",
+# RFC 8746: tag → type of the elements. 68 is uint8 "clamped", 76 is reserved; 128-bit floats are left out.
+TYPED_ARRAYS: Mapping[int, np.dtype[Any]] = {
+    tag: np.dtype(code)
+    for tag, code in {
+        64: "u1", 65: ">u2", 66: ">u4", 67: ">u8", 68: "u1", 69: "<u2", 70: "<u4", 71: "<u8",
+        72: "i1", 73: ">i2", 74: ">i4", 75: ">i8", 77: "<i2", 78: "<i4", 79: "<i8",
+        80: ">f2", 81: ">f4", 82: ">f8", 84: "<f2", 85: "<f4", 86: "<f8",
+    }.items()
 }  # fmt: skip
-_ARRAY_TAGS: Mapping[str, int] = {"u2": 69, "u4": 70, "u8": 71, "i1": 72, "i2": 77, "i4": 78, "i8": 79, "f4": 85, "f8": 86}
+_ARRAY_TAGS: Mapping[str, int] = {
+    "u2": 69,
+    "u4": 70,
+    "u8": 71,
+    "i1": 72,
+    "i2": 77,
+    "i4": 78,
+    "i8": 79,
+    "f4": 85,
+    "f8": 86,
+}
 
 
 def decode_cbor(data: bytes) -> Any:
@@ -84,58 +97,52 @@ def decode_cbor(data: bytes) -> Any:
     """
     stream = io.BytesIO(data)
     try:
-        value = cbor2.CBORDecoder(stream, **_DECODER_OPTIONS).decode()
-    except (ValueError, cbor2.CBORDecodeError, RecursionError) as error:
+        value = cbor2.CBORDecoder(stream, tag_hook=_decode_tag, **_LIMITS).decode()
+    except (ValueError, TypeError, cbor2.CBORDecodeError, RecursionError) as error:
         cause = error.__cause__
-        raise DecodeError("Not CBOR: %s" % (cause if isinstance(cause, DecodeError) else error)) from error
+        raise DecodeError(f"Not CBOR: {cause if isinstance(cause, DecodeError) else error}") from error
     if stream.tell() != len(data):
-        raise DecodeError("Not CBOR: %d bytes after the end" % (len(data) - stream.tell()))
+        raise DecodeError(f"Not CBOR: {len(data) - stream.tell()} bytes after the end")
     return value
 
 
-def _typed_array_decoder(tag: int, dtype: str) -> Callable[[Any], Any]:
-    item_type = np.dtype(dtype)
-
-    def decode(decoder: Any) -> Any:
-        raw = decoder.decode()
-        if not isinstance(raw, bytes) or len(raw) % item_type.itemsize:
-            raise DecodeError("tag %d needs a byte string of whole %s items" % (tag, item_type.name))
-        return np.frombuffer(raw, item_type)
-
-    return decode
-
-
-def _tag_refuser(tag: int) -> Callable[[Any], NoReturn]:
-    def refuse(decoder: Any) -> NoReturn:
-        raise DecodeError("tag %d is not supported" % tag)
-
-    return refuse
+def _decode_tag(*args: Any) -> Any:
+    """The value of a tag that cbor2 does not know itself; the order of the arguments depends on its version."""
+    tagged = next(arg for arg in args if isinstance(arg, cbor2.CBORTag))
+    item_type = TYPED_ARRAYS.get(tagged.tag)
+    if item_type is None:
+        raise DecodeError(f"tag {tagged.tag} is not supported")
+    raw = tagged.value
+    if not isinstance(raw, bytes) or len(raw) % item_type.itemsize:
+        raise DecodeError(f"tag {tagged.tag} needs a byte string of whole {item_type.name} items")
+    return np.frombuffer(raw, item_type)
 
 
-def _refuse_unknown_tag(*args: Any) -> NoReturn:
-    raise DecodeError("tag %s is not supported" % getattr(args[-1], "tag", "?"))
+def _refuse_tag(*args: Any) -> NoReturn:
+    raise DecodeError("a tag that has no place in a message")
 
 
-def _semantic_decoders() -> Dict[int, Callable[[Any], Any]]:
-    decoders: Dict[int, Callable[[Any], Any]] = {}
-    # What cbor2 would turn into dates, decimals, regular expressions, cyclic references, sets …
-    for tag in (0, 1, 4, 5, 25, 28, 29, 30, 35, 36, 37, 52, 54, 100, 256, 258, 260, 261, 1004, 43000):
-        decoders[tag] = _tag_refuser(tag)
-    for tag, dtype in TYPED_ARRAYS.items():
-        decoders[tag] = _typed_array_decoder(tag, dtype)
-    return decoders
+def _limits() -> Dict[str, Any]:
+    """Options for cbor2 from version 6 on; older ones, for older Pythons, lack them.
+
+    What cbor2 would turn into dates, decimals, regular expressions, cyclic references, sets … is refused.
+    """
+    tags = (0, 1, 4, 5, 25, 28, 29, 30, 35, 36, 37, 52, 54, 100, 256, 258, 260, 261, 1004, 43000)
+    limits: Dict[str, Any] = {"semantic_decoders": dict.fromkeys(tags, _refuse_tag), "max_depth": MAX_DEPTH}
+    try:
+        cbor2.CBORDecoder(io.BytesIO(), **limits)
+    except TypeError:
+        return {}
+    return limits
 
 
-_DECODER_OPTIONS: Dict[str, Any] = {
-    "tag_hook": _refuse_unknown_tag,
-    "semantic_decoders": _semantic_decoders(),
-    "max_depth": MAX_DEPTH,
-}
+_LIMITS = _limits()
 
 
 def encode_cbor(value: Any) -> bytes:
     """The CBOR item of a value; NumPy arrays become typed arrays (RFC 8746), of uint8 a plain byte string.
 
+    Binary data must be bytes or bytearray: cbor2 takes a memoryview for a list of numbers.
     Raises TypeError or ValueError for what CBOR cannot hold.
     """
     try:
@@ -148,13 +155,11 @@ def encode_cbor(value: Any) -> bytes:
 def _cbor_default(encoder: Any, value: Any) -> None:
     if isinstance(value, np.generic):
         encoder.encode(value.item())
-    elif isinstance(value, memoryview):
-        encoder.encode(bytes(value))
     elif isinstance(value, np.ndarray) and value.ndim == 1 and value.dtype.kind in "iuf":
-        kind = "%s%d" % (value.dtype.kind, value.dtype.itemsize)
+        kind = f"{value.dtype.kind}{value.dtype.itemsize}"
         raw = value.astype("<" + kind).tobytes()
         encoder.encode(raw if kind == "u1" else cbor2.CBORTag(_ARRAY_TAGS[kind], raw))
     elif isinstance(value, np.ndarray):
         encoder.encode(value.tolist())
     else:
-        raise TypeError("%s is not CBOR serializable" % type(value).__name__)
+        raise TypeError(f"{type(value).__name__} is not CBOR serializable")

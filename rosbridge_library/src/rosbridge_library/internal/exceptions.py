@@ -42,37 +42,37 @@ class InvalidTypeStringException(TypeLoadError):
     """A type name is not of the form `package/Type`."""
 
     def __init__(self, type_string: object) -> None:
-        super().__init__("%r is not a valid type string: expected package/Type" % (type_string,))
+        super().__init__(f"{type_string!r} is not a valid type string: expected package/Type")
 
 
 class InvalidPackageException(TypeLoadError):
     """The package of a type is not installed, or fails to import."""
 
     def __init__(self, package: str, original: Optional[BaseException] = None) -> None:
-        reason = "" if original is None else ": %s" % original
-        super().__init__("Unable to import package %s%s" % (package, reason))
+        reason = "" if original is None else f": {original}"
+        super().__init__(f"Unable to import package {package}{reason}")
 
 
 class InvalidModuleException(TypeLoadError):
     """A package has no `msg` (or `srv`) module, or that module fails to import."""
 
     def __init__(self, package: str, module: str, original: Optional[BaseException] = None) -> None:
-        reason = "" if original is None else ": %s" % original
-        super().__init__("Unable to import %s.%s from package %s%s" % (package, module, package, reason))
+        reason = "" if original is None else f": {original}"
+        super().__init__(f"Unable to import {package}.{module} from package {package}{reason}")
 
 
 class InvalidClassException(TypeLoadError):
     """A package's `msg` (or `srv`) module has no such type."""
 
     def __init__(self, package: str, module: str, name: str) -> None:
-        super().__init__("Unable to find %s class %s in package %s" % (module, name, package))
+        super().__init__(f"Unable to find {module} class {name} in package {package}")
 
 
 class InvalidMessageException(RosbridgeError):
     """An object is not a ROS message."""
 
     def __init__(self, inst: object) -> None:
-        super().__init__("Unable to extract message values from %s instance" % type(inst).__name__)
+        super().__init__(f"Unable to extract message values from {type(inst).__name__} instance")
 
 
 class ValuesError(RosbridgeError, ValueError):
@@ -90,10 +90,10 @@ class FieldTypeMismatchException(ValuesError):
     """A field was given a value that its type does not take."""
 
     def __init__(self, roottype: str, path: str, expected: str, found: str) -> None:
-        where = "%s message requires %s for field '%s'" % (roottype, expected, path)
+        where = f"{roottype} message requires {expected} for field '{path}'"
         if not path:
-            where = "%s message requires %s" % (roottype, expected)
-        super().__init__("%s, but got %s" % (where, found), path)
+            where = f"{roottype} message requires {expected}"
+        super().__init__(f"{where}, but got {found}", path)
         self.roottype = roottype
         self.expected = expected
         self.found = found
@@ -103,5 +103,5 @@ class NonexistentFieldException(ValuesError):
     """Values name a field that the message type does not have."""
 
     def __init__(self, roottype: str, path: str) -> None:
-        super().__init__("Message type %s does not have a field %s" % (roottype, path), path)
+        super().__init__(f"Message type {roottype} does not have a field {path}", path)
         self.roottype = roottype

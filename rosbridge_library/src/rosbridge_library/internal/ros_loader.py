@@ -104,7 +104,7 @@ def _get_class(typestring: str, kind: str) -> Any:
 
 def _load_module(package: str, kind: str) -> ModuleType:
     """The module `package.kind`; packages installed since the last look are found."""
-    name = "%s.%s" % (package, kind)
+    name = f"{package}.{kind}"
     if name in sys.modules:
         return sys.modules[name]
     importlib.invalidate_caches()
