@@ -9,6 +9,7 @@ from typing import Any, Callable, Dict, List, Mapping, Optional, Sequence
 import pytest
 
 from rosapi.api import Api
+from rosapi.service_types import Tell
 from rosbridge_library.access import Access
 from rosbridge_library.internal.exceptions import RosbridgeError
 from rosbridge_library.ros.master import MasterError, MasterUnreachable
@@ -51,15 +52,17 @@ def robot(master_call: Call, monkeypatch: pytest.MonkeyPatch) -> Call:
     return master_call
 
 
+def _probe(uris: Mapping[str, str], tell: Tell) -> None:
+    for service, uri in uris.items():
+        assert uri == f"rosrpc://{service.split('/')[1]}:5000"
+        tell(service, SERVICE_TYPES[service])
+
+
 def _api(call: Call, **globs: str) -> Api:
     def look_up(services: Sequence[str]) -> Mapping[str, str]:
         return {service: call("lookupService", service) for service in services}
 
-    def probe(uris: Mapping[str, str]) -> Mapping[str, Optional[str]]:
-        assert all(uri == f"rosrpc://{service.split('/')[1]}:5000" for service, uri in uris.items())
-        return {service: SERVICE_TYPES[service] for service in uris}
-
-    return Api(call, look_up, probe, lambda: (12, 34), Access.from_parameters(**globs))
+    return Api(call, look_up, _probe, lambda: (12, 34), Access.from_parameters(**globs))
 
 
 @pytest.fixture
@@ -143,9 +146,7 @@ class TestEverythingAllowed:
         assert api.service_host("/hung/reset") == {"host": "hung"}
 
     def test_details(self, api: Api) -> None:
-        assert [each.type for each in api.message_details("std_msgs/String")["typedefs"]] == [
-            "std_msgs/String"
-        ]
+        assert [each.type for each in api.message_details("std_msgs/String")["typedefs"]] == ["std_msgs/String"]
         assert api.service_request_details("std_srvs/SetBool")["typedefs"][0].fieldnames == ["data"]
         assert api.service_response_details("std_srvs/SetBool")["typedefs"][0].fieldnames == [
             "success",
@@ -193,9 +194,7 @@ class TestGlobs:
         assert api.services()["services"] == sorted(SERVICE_TYPES)
 
     def test_an_action_server_needs_all_its_topics_open(self, robot: Call) -> None:
-        assert _api(robot, topics_glob="[/move/goal, /move/status]").action_servers() == {
-            "action_servers": []
-        }
+        assert _api(robot, topics_glob="[/move/goal, /move/status]").action_servers() == {"action_servers": []}
 
     def test_services(self, robot: Call) -> None:
         api = _api(robot, services_glob="['/base/*']")
@@ -212,9 +211,9 @@ class TestGlobs:
     def test_closed_services_are_not_even_asked(self, robot: Call) -> None:
         asked: List[str] = []
 
-        def probe(uris: Mapping[str, str]) -> Mapping[str, Optional[str]]:
+        def probe(uris: Mapping[str, str], tell: Tell) -> None:
             asked.extend(uris)
-            return dict.fromkeys(uris)
+            _probe(uris, tell)
 
         def look_up(services: Sequence[str]) -> Mapping[str, str]:
             return {service: robot("lookupService", service) for service in services}
@@ -272,9 +271,7 @@ class TestMaster:
         def look_up(services: Sequence[str]) -> Mapping[str, str]:
             return {each: robot("lookupService", each) for each in services if each != "/lidar/reset"}
 
-        api = Api(
-            robot, look_up, lambda uris: {each: SERVICE_TYPES[each] for each in uris}, lambda: None, Access()
-        )
+        api = Api(robot, look_up, _probe, lambda: None, Access())
         assert api.services_for_type("std_srvs/Trigger") == {"services": ["/base/reset"]}
 
     def test_a_parameter_that_the_master_cannot_give_is_an_error(self, robot: Call) -> None:

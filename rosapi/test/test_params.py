@@ -25,10 +25,7 @@ def params(master_call: Call) -> Params:
 
 XML_TEXT = st.text(st.characters(blacklist_categories=("Cs", "Cc"), blacklist_characters="\ufffe\uffff"))
 VALUES = st.recursive(
-    st.booleans()
-    | st.integers(-(2**31), 2**31 - 1)
-    | st.floats(allow_nan=False, allow_infinity=False)
-    | XML_TEXT,
+    st.booleans() | st.integers(-(2**31), 2**31 - 1) | st.floats(allow_nan=False, allow_infinity=False) | XML_TEXT,
     lambda children: st.lists(children, max_size=4) | st.dictionaries(XML_TEXT, children, max_size=4),
     max_leaves=12,
 )
@@ -45,7 +42,8 @@ class TestJson:
             value = from_json(text)
         except ParameterError:
             return
-        assert from_json(to_json(value)) == value or text.strip() in {"NaN", "Infinity", "-Infinity"}
+        if "NaN" not in text and "Infinity" not in text:  # which are read, but written as null
+            assert from_json(to_json(value)) == value
 
     @pytest.mark.parametrize(
         ("value", "text"),
@@ -209,9 +207,7 @@ class TestGlobs:
             ("/newer", '{"/../../other": 1}'),
         ],
     )
-    def test_nothing_that_is_closed_is_changed(
-        self, limited: Params, master_call: Call, name: str, value: str
-    ) -> None:
+    def test_nothing_that_is_closed_is_changed(self, limited: Params, master_call: Call, name: str, value: str) -> None:
         before = master_call("getParam", "/")
         if name != "/newer":
             with pytest.raises(ParameterError, match="params_glob"):

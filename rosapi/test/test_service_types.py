@@ -5,12 +5,12 @@ from __future__ import annotations
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Dict, List, Mapping, Optional
+from typing import Dict, List, Mapping, Optional
 
 import pytest
 
 from rosapi import service_types
-from rosapi.service_types import SILENT_FOR_S, ServiceTypes
+from rosapi.service_types import SILENT_FOR_S, ServiceTypes, Tell
 
 
 class Clock:
@@ -28,9 +28,10 @@ class Nodes:
         self.types: Dict[str, Optional[str]] = dict(types)
         self.asked: List[List[str]] = []
 
-    def probe(self, uris: Mapping[str, str]) -> Mapping[str, Optional[str]]:
+    def probe(self, uris: Mapping[str, str], tell: Tell) -> None:
         self.asked.append(sorted(uris))
-        return {service: self.types[service] for service in uris}
+        for service in uris:
+            tell(service, self.types[service])
 
 
 A, B = {"/a": "rosrpc://h:1"}, {"/b": "rosrpc://h:2"}
@@ -69,41 +70,46 @@ def test_a_restarted_service_is_asked_at_once() -> None:
     assert types.types({"/a": "rosrpc://h:2"}) == {"/a": "p/A"}
 
 
-def test_concurrent_callers_share_a_probe_and_others_do_not_wait_for_it() -> None:
+def test_concurrent_callers_share_a_probe_and_wait_for_their_own_services_only() -> None:
     begun, go = threading.Event(), threading.Event()
     asked: List[List[str]] = []
 
-    def probe(uris: Mapping[str, str]) -> Mapping[str, Optional[str]]:
+    def probe(uris: Mapping[str, str], tell: Tell) -> None:
+        """/b answers at once, /a when it may."""
         asked.append(sorted(uris))
-        if "/a" in uris:
-            begun.set()
-            assert go.wait(10.0)
-        return dict.fromkeys(uris, "p/T")
+        tell("/b", "p/B")
+        begun.set()
+        assert go.wait(10.0)
+        tell("/a", "p/A")
 
     types = ServiceTypes(probe, Clock())
     with ThreadPoolExecutor(4) as pool:
-        first = pool.submit(types.types, A)
+        first = pool.submit(types.types, BOTH)
         assert begun.wait(10.0)
         same = pool.submit(types.types, A)
-        assert types.types(B) == {"/b": "p/T"}
+        assert types.types(B) == {"/b": "p/B"}
         assert not first.done()
+        assert not same.done()
         go.set()
-        assert first.result(10.0) == same.result(10.0) == {"/a": "p/T"}
-    assert asked == [["/a"], ["/b"]]
+        assert first.result(10.0) == {"/a": "p/A", "/b": "p/B"}
+        assert same.result(10.0) == {"/a": "p/A"}
+    assert asked == [["/a", "/b"]]
 
 
 def test_a_probe_that_fails_is_told_and_not_kept() -> None:
-    outcomes: List[Any] = [RuntimeError("no file descriptors left"), {"/a": "p/A"}]
+    failures = [RuntimeError("no file descriptors left")]
 
-    def probe(uris: Mapping[str, str]) -> Mapping[str, Optional[str]]:
-        outcome = outcomes.pop(0)
-        if isinstance(outcome, RuntimeError):
-            raise outcome
-        return dict(outcome)
+    def probe(uris: Mapping[str, str], tell: Tell) -> None:
+        if "/b" in uris:
+            tell("/b", "p/B")
+        if failures:
+            raise failures.pop()
+        tell("/a", "p/A")
 
     types = ServiceTypes(probe, Clock())
     with pytest.raises(RuntimeError, match="descriptors"):
-        types.types(A)
+        types.types(BOTH)
+    assert types.types(B) == {"/b": "p/B"}
     assert types.types(A) == {"/a": "p/A"}
 
 

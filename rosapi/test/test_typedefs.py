@@ -46,11 +46,7 @@ def _installed(kind: str) -> Iterator[str]:
             continue
         for name, value in vars(types).items():
             is_part = kind == "srv" and name.endswith(("Request", "Response"))
-            if (
-                isinstance(value, type)
-                and not is_part
-                and getattr(value, "_type", "") == f"{module.name}/{name}"
-            ):
+            if isinstance(value, type) and not is_part and getattr(value, "_type", "") == f"{module.name}/{name}":
                 yield value._type
 
 
@@ -101,9 +97,7 @@ def test_arrays_tell_their_element_type_and_length() -> None:
 
 
 def test_booleans_and_durations() -> None:
-    assert message_typedefs("std_msgs/Bool") == [
-        TypeDef("std_msgs/Bool", ["data"], ["bool"], [-1], ["False"], [], [])
-    ]
+    assert message_typedefs("std_msgs/Bool") == [TypeDef("std_msgs/Bool", ["data"], ["bool"], [-1], ["False"], [], [])]
     assert message_typedefs("std_msgs/Duration") == [
         TypeDef("std_msgs/Duration", ["data"], ["duration"], [-1], ["{}"], [], []),
         TIME._replace(type="duration"),
@@ -164,9 +158,7 @@ def test_what_is_not_installed_fails_with_the_reason(describe: Any, name: str, r
 def _definition_of(message_class: Any) -> genmsg.MsgSpec:
     """What genmsg reads from the text of the definition, above those of what it contains."""
     own, *_ = message_class._full_text.split("=" * 80)
-    return genmsg.msg_loader.load_msg_from_string(
-        genmsg.MsgContext.create_default(), own, message_class._type
-    )
+    return genmsg.msg_loader.load_msg_from_string(genmsg.MsgContext.create_default(), own, message_class._type)
 
 
 @pytest.mark.parametrize("name", INSTALLED_MESSAGES)

@@ -16,7 +16,7 @@ from rosapi import typedefs
 from rosapi.graph import Graph, action_servers, fetch_graph, names_with
 from rosapi.params import Params
 from rosapi.recent import Recent
-from rosapi.service_types import ServiceTypes, Types
+from rosapi.service_types import Probe, ServiceTypes
 from rosapi.xml_text import is_xml_text
 from rosbridge_library.access import Access
 from rosbridge_library.internal.exceptions import TypeLoadError
@@ -41,7 +41,7 @@ class Api:
         self,
         call: Callable[..., Any],
         look_up: Callable[[Sequence[str]], Mapping[str, str]],
-        probe: Callable[[Mapping[str, str]], Types],
+        probe: Probe,
         now: Callable[[], Any],
         access: Access,
     ) -> None:
@@ -50,9 +50,7 @@ class Api:
         self._access = access
         self._params = Params(call, access)
         self._graph: Recent[Graph] = Recent(lambda: fetch_graph(call), MAX_AGE_S)
-        self._uris: Recent[Mapping[str, str]] = Recent(
-            lambda: look_up(self._graph.get().services()), MAX_AGE_S
-        )
+        self._uris: Recent[Mapping[str, str]] = Recent(lambda: look_up(self._graph.get().services()), MAX_AGE_S)
         self._service_types = ServiceTypes(probe)
 
     # Topics.

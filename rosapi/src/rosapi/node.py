@@ -114,9 +114,7 @@ def handler(answer: Callable[..., Response], service_type: Any) -> Callable[[Any
 
 def read_access(master: Master) -> Access:
     """What the private parameters topics_glob … params_glob allow. Raises MasterUnreachable."""
-    return Access.from_parameters(
-        *(_read_glob(master, f"{master.caller_id}/{kind}_glob") for kind in GLOB_KINDS)
-    )
+    return Access.from_parameters(*(_read_glob(master, f"{master.caller_id}/{kind}_glob") for kind in GLOB_KINDS))
 
 
 def _read_glob(master: Master, name: str) -> Optional[str]:
@@ -141,7 +139,7 @@ def _patiently(ask: Callable[[], T], leaving: threading.Event) -> T:
     raise _ToldToLeave
 
 
-class _ToldToLeave(Exception):  # noqa: N818 (no error)
+class _ToldToLeave(Exception):
     """A signal came before the node was up."""
 
 

@@ -89,13 +89,9 @@ def _check(value: Any, where: str, depth: int) -> None:
     elif value is None:
         raise ParameterError(f"the parameter server can't hold null{_at(where)}")
     elif isinstance(value, int) and not INT_LIMITS[0] <= value <= INT_LIMITS[1]:
-        raise ParameterError(
-            f"the parameter server holds integers of 32 bits only, not {_shown(value)}{_at(where)}"
-        )
+        raise ParameterError(f"the parameter server holds integers of 32 bits only, not {_shown(value)}{_at(where)}")
     elif isinstance(value, str) and not is_xml_text(value):
-        raise ParameterError(
-            f"the parameter server can't hold control characters or half a surrogate pair{_at(where)}"
-        )
+        raise ParameterError(f"the parameter server can't hold control characters or half a surrogate pair{_at(where)}")
 
 
 def _shown(value: int) -> str:

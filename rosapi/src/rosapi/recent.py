@@ -19,9 +19,7 @@ T = TypeVar("T")
 class Recent(Generic[T]):
     """The value of `fetch()`, whose fetch began at most `max_age_s` ago, or is under way."""
 
-    def __init__(
-        self, fetch: Callable[[], T], max_age_s: float, clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, fetch: Callable[[], T], max_age_s: float, clock: Callable[[], float] = time.monotonic) -> None:
         self._fetch = fetch
         self._max_age_s = max_age_s
         self._clock = clock

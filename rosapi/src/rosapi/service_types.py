@@ -19,7 +19,8 @@ from rosbridge_library.ros.service_probe import ServiceUnreachable, probe_servic
 
 logger = logging.getLogger("rosbridge.rosapi")
 
-Types = Mapping[str, Optional[str]]
+Tell = Callable[[str, Optional[str]], None]
+Probe = Callable[[Mapping[str, str], Tell], None]
 
 PROBE_TIMEOUT_S = 1.5
 SILENT_FOR_S = 5.0
@@ -28,20 +29,27 @@ SILENT_FOR_S = 5.0
 MAX_KNOWN = 10_000
 
 
-def probe_types(caller_id: str, uris: Mapping[str, str]) -> Types:
-    """Ask the nodes at `uris` for the types of their services, all at once; None for those that don't answer.
+def probe_types(caller_id: str, uris: Mapping[str, str], tell: Tell) -> None:
+    """Ask the nodes at `uris` for the types of their services, all at once; `tell` what each node answers when it does.
 
     Takes `PROBE_TIMEOUT_S` at most. Blocks the calling thread.
     """
-    answers = asyncio.run(probe_services(uris, caller_id, PROBE_TIMEOUT_S))
-    types: Dict[str, Optional[str]] = {}
-    for service, answer in answers.items():
-        if isinstance(answer, ServiceUnreachable):
-            logger.debug("%s", answer)
-            types[service] = None
-        else:
-            types[service] = answer.get("type")
-    return types
+    nodes: Dict[str, Dict[str, str]] = {}
+    for service, uri in uris.items():
+        nodes.setdefault(uri, {})[service] = uri
+
+    async def probe_node(services: Mapping[str, str]) -> None:
+        for service, answer in (await probe_services(services, caller_id, PROBE_TIMEOUT_S)).items():
+            if isinstance(answer, ServiceUnreachable):
+                logger.debug("%s", answer)
+                tell(service, None)
+            else:
+                tell(service, answer.get("type"))
+
+    async def probe_nodes() -> None:
+        await asyncio.gather(*(probe_node(services) for services in nodes.values()))
+
+    asyncio.run(probe_nodes())
 
 
 class _Known(NamedTuple):
@@ -53,12 +61,11 @@ class _Known(NamedTuple):
 class ServiceTypes:
     """What each service answered, or is being asked.
 
-    `probe` takes the uris of services by name, and gives for each its type, or None when it didn't answer.
+    `probe` takes the uris of services by name, and tells of each, once, its type, or None when it didn't answer; it
+    returns when it has told of all.
     """
 
-    def __init__(
-        self, probe: Callable[[Mapping[str, str]], Types], clock: Callable[[], float] = time.monotonic
-    ) -> None:
+    def __init__(self, probe: Probe, clock: Callable[[], float] = time.monotonic) -> None:
         self._probe = probe
         self._clock = clock
         self._lock = threading.Lock()
@@ -90,13 +97,12 @@ class ServiceTypes:
 
     def _ask(self, uris: Mapping[str, str], answers: Mapping[str, Future[Optional[str]]]) -> None:
         try:
-            types = self._probe(uris)
+            self._probe(uris, lambda service, kind: answers[service].set_result(kind))
         except BaseException as error:  # whatever it is, those who wait must hear of it
             for service in uris:
-                answers[service].set_exception(error)
+                if not answers[service].done():
+                    answers[service].set_exception(error)
             raise
-        for service in uris:
-            answers[service].set_result(types.get(service))
 
     def _forget_oldest(self, wanted: int) -> None:
         surplus: List[str] = list(self._known)[: max(0, len(self._known) - max(MAX_KNOWN, wanted))]

@@ -39,9 +39,7 @@ def look_up_services(master: Master, services: Sequence[str]) -> Dict[str, str]:
         with xmlrpc.client.ServerProxy(master.uri, _Transport(master.timeout)) as proxy:
             answers: Any = proxy.system.multicall(calls)
     except (OSError, http.client.HTTPException, xmlrpc.client.Error, ExpatError) as error:
-        raise MasterUnreachable(
-            f"the ROS master at {master.uri} doesn't tell where services are: {error}"
-        ) from error
+        raise MasterUnreachable(f"the ROS master at {master.uri} doesn't tell where services are: {error}") from error
     return {service: answer[0][2] for service, answer in zip(services, answers) if _succeeded(answer)}
 
 
