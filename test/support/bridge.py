@@ -15,6 +15,9 @@ from support.process import Process
 from support.ros import RosMaster, executable
 from support.wait import wait_until
 
+ROSAPI_SERVICES = 27
+"""rosapi's own 25, and the two that each node has for its loggers."""
+
 running: List[Bridge] = []
 """The servers whose logs are looked at when a test ends (see conftest.py)."""
 
@@ -52,7 +55,7 @@ class Bridge:
         self._environment = environment
         self._logs: Dict[Process, int] = {}
         try:
-            self._start(port=0)
+            self._start(self._parameters.get("port", 0))
         except BaseException:
             self.stop()
             raise
@@ -86,7 +89,7 @@ class Bridge:
         """Ends it and starts it again on the same port."""
         for process in reversed(list(self._logs)):
             process.stop()
-        self._start(port=self.port)
+        self._start(self.port)
 
     def unexpected(self, allowed: Iterable[str] = ()) -> List[str]:
         """Error lines and tracebacks in the logs since the last time this was asked, but for those in which
@@ -107,7 +110,7 @@ class Bridge:
     def _start(self, port: int) -> None:
         if self._actual_port():
             self.master.call("deleteParam", f"/{self.name}/actual_port")  # of the server that ran before
-        for parameter, value in {"port": port, "address": "127.0.0.1", **self._parameters}.items():
+        for parameter, value in {"address": "127.0.0.1", **self._parameters, "port": port}.items():
             self.master.set_param(f"/{self.name}/{parameter}", value)
         self.process = self._launch("rosbridge_server", "rosbridge_websocket", self.name, self._arguments)
         self.port = wait_until(
@@ -124,7 +127,7 @@ class Bridge:
                 self.master.set_param(f"/rosapi/{glob}", self._parameters[glob])
         process = self._launch("rosapi", "rosapi_node", "rosapi", [])
         wait_until(
-            lambda: self._ready(process) and self.master.providers("/rosapi/get_time"),
+            lambda: self._ready(process) and len(self.master.services_of("/rosapi")) >= ROSAPI_SERVICES,
             20.0,
             lambda: f"the services of rosapi:\n{process.output}",
         )

@@ -9,6 +9,7 @@ one CBOR.
 from __future__ import annotations
 
 import base64
+import contextlib
 import io
 import itertools
 import json
@@ -42,7 +43,8 @@ class Client:
         self.timeout = timeout
         self.inbox: List[Message] = []
         self.frames: List[Union[str, bytes]] = []
-        self.connection = connect(url, **settings)
+        self._closing = contextlib.ExitStack()
+        self.connection = self._closing.enter_context(connect(url, **settings))
 
     def __enter__(self) -> Client:
         return self
@@ -57,7 +59,7 @@ class Client:
 
     def close(self) -> None:
         """Closes the connection as browsers do; harmless when it is closed already."""
-        self.connection.close()
+        self._closing.close()
 
     def drop(self) -> None:
         """Loses the connection without a closing handshake, as a client does that crashes."""
@@ -157,9 +159,7 @@ class Client:
         id=…)`."""
         return self._operation("call_service", service=service, args={} if args is None else args, **options)
 
-    def call_service(
-        self, service: str, args: Any = None, wait: Optional[float] = None, **options: Any
-    ) -> Message:
+    def call_service(self, service: str, args: Any = None, wait: Optional[float] = None, **options: Any) -> Message:
         """Calls a service and returns the whole service_response, which must come within `wait` seconds."""
         number = self.request(service, args, **options)
         return self.wait_for(timeout=wait, op="service_response", id=number)
@@ -173,9 +173,7 @@ class Client:
         deadline = time.monotonic() + (self.timeout if timeout is None else timeout)
         return [self.next_message(topic, max(0.0, deadline - time.monotonic())) for _ in range(count)]
 
-    def serve(
-        self, service: str, handler: Callable[[Any], Tuple[bool, Any]], timeout: Optional[float] = None
-    ) -> Any:
+    def serve(self, service: str, handler: Callable[[Any], Tuple[bool, Any]], timeout: Optional[float] = None) -> Any:
         """Answers the next call of a service that this client advertised with `handler(args)`, which returns
         (result, values); the args."""
         call = self.wait_for(timeout=timeout, op="call_service", service=service)
@@ -211,9 +209,7 @@ def unpack_png(data: str) -> bytes:
 def defragment(fragments: Sequence[Message]) -> Message:
     """The message whose fragment operations these are, in any order."""
     ordered = sorted(fragments, key=lambda fragment: int(fragment["num"]))
-    assert [fragment["num"] for fragment in ordered] == list(range(ordered[0]["total"])), (
-        "fragments are missing"
-    )
+    assert [fragment["num"] for fragment in ordered] == list(range(ordered[0]["total"])), "fragments are missing"
     return decode("".join(fragment["data"] for fragment in ordered))
 
 

@@ -45,11 +45,7 @@ class Node:
 
     def records(self, kind: Optional[str] = None) -> List[Any]:
         """The values of the lines `{kind: value}` written so far, or all such lines."""
-        lines = [
-            line
-            for line in self.process.output.splitlines(True)
-            if line.startswith("{") and line.endswith("\n")
-        ]
+        lines = [line for line in self.process.output.splitlines(True) if line.startswith("{") and line.endswith("\n")]
         found = [json.loads(line) for line in lines]
         return found if kind is None else [record[kind] for record in found if kind in record]
 
@@ -102,9 +98,7 @@ def publish(
     return _program(master, "publisher.py", options, name, arguments)
 
 
-def echo(
-    master: RosMaster, topic: str, kind: str, *, name: str = "echo", arguments: Sequence[str] = ()
-) -> Node:
+def echo(master: RosMaster, topic: str, kind: str, *, name: str = "echo", arguments: Sequence[str] = ()) -> Node:
     """A node that subscribes; each message becomes a record `message` (uint8[] as lists of ints)."""
     return _program(master, "echo.py", {"topic": topic, "kind": kind}, name, arguments)
 
@@ -138,9 +132,7 @@ def script(master: RosMaster, source: str, *, name: str = "script", arguments: S
     return _started(master, [str(path), *arguments], name)
 
 
-def _program(
-    master: RosMaster, program: str, options: Dict[str, Any], name: str, arguments: Sequence[str]
-) -> Node:
+def _program(master: RosMaster, program: str, options: Dict[str, Any], name: str, arguments: Sequence[str]) -> Node:
     command = [str(_PROGRAMS / program), json.dumps(options), f"__name:={name}", *arguments]
     return _started(master, command, name)
 

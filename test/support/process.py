@@ -73,9 +73,7 @@ class Process:
             ended = not self.alive  # looked at before the output, which is then complete
             match = re.search(pattern, self.output, re.MULTILINE)
             if match is None and ended:
-                raise AssertionError(
-                    f"{self.name} ended ({self.exit_code}) without {pattern!r}:\n{self.output}"
-                )
+                raise AssertionError(f"{self.name} ended ({self.exit_code}) without {pattern!r}:\n{self.output}")
             return match
 
         return wait_until(found, timeout, lambda: f"{pattern!r} in the output of {self.name}:\n{self.output}")

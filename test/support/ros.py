@@ -76,7 +76,9 @@ class _DeadlineTransport(xmlrpc.client.Transport):
         self._timeout = timeout
 
     def make_connection(self, host: Any) -> http.client.HTTPConnection:
-        return http.client.HTTPConnection(str(host), timeout=self._timeout)
+        connection = http.client.HTTPConnection(str(host), timeout=self._timeout)
+        self._connection = host, connection  # which close() closes
+        return connection
 
 
 class RosMaster:
@@ -113,8 +115,8 @@ class RosMaster:
     def call(self, method: str, *arguments: Any) -> Any:
         """The value of one call of the master API; RuntimeError when the master refuses, OSError when it is
         down."""
-        proxy = xmlrpc.client.ServerProxy(self.uri, transport=_DeadlineTransport(5.0), allow_none=False)
-        code, reason, value = getattr(proxy, method)(CALLER_ID, *arguments)  # type: ignore[misc]
+        with xmlrpc.client.ServerProxy(self.uri, transport=_DeadlineTransport(5.0)) as proxy:
+            code, reason, value = getattr(proxy, method)(CALLER_ID, *arguments)  # type: ignore[misc]
         if code != 1:
             raise RuntimeError(f"{method}{arguments}: {reason}")
         return value
@@ -135,12 +137,14 @@ class RosMaster:
     def providers(self, service: str) -> List[str]:
         return self._registered(2, service)
 
+    def services_of(self, node: str) -> List[str]:
+        """The services that a node provides."""
+        return [service for service, nodes in self.call("getSystemState")[2] if node in nodes]
+
     def _registered(self, kind: int, name: str) -> List[str]:
         return [node for entry, nodes in self.call("getSystemState")[kind] if entry == name for node in nodes]
 
-    def process_in(
-        self, command: List[str], name: str, environment: Optional[Dict[str, str]] = None
-    ) -> Process:
+    def process_in(self, command: List[str], name: str, environment: Optional[Dict[str, str]] = None) -> Process:
         """A process in this master's environment, with `environment` on top; its log is in `directory`."""
         return Process(
             command,

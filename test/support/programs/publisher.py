@@ -16,7 +16,7 @@ def main() -> None:
     wanted = options()
     rospy.init_node("publisher")
     message_class = roslib.message.get_message_class(wanted["kind"])
-    publisher = rospy.Publisher(wanted["topic"], message_class, latch=wanted["latch"], queue_size=None)
+    publisher = rospy.Publisher(wanted["topic"], message_class, latch=wanted["latch"], queue_size=0)  # 0: no bound
     ready()
     while publisher.get_num_connections() < wanted["subscribers"] and not rospy.is_shutdown():
         time.sleep(0.01)
