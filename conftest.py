@@ -23,9 +23,7 @@ def _make_importable() -> None:
     try:
         import rosbridge_msgs.msg  # noqa: F401
     except ImportError:
-        sys.path[1:1] = [
-            str(path) for path in (ROOT / "build" / "devel" / "lib").glob("python3*/dist-packages")
-        ]
+        sys.path[1:1] = [str(path) for path in (ROOT / "build" / "devel" / "lib").glob("python3*/dist-packages")]
 
 
 _make_importable()

@@ -21,11 +21,7 @@ def test_wait_until_gives_up_with_the_message():
 
 
 def test_a_process_is_ended_with_its_group(tmp_path):
-    source = (
-        "import subprocess, time\n"
-        "print(subprocess.Popen(['sleep', '1000']).pid, flush=True)\n"
-        "time.sleep(1000)\n"
-    )
+    source = "import subprocess, time\nprint(subprocess.Popen(['sleep', '1000']).pid, flush=True)\ntime.sleep(1000)\n"
     command = [sys.executable, "-c", source]
     with Process(command, name="parent", directory=tmp_path, environment=dict(os.environ)) as process:
         child = int(process.wait_for_line(r"^(\d+)$").group(1))
@@ -48,11 +44,7 @@ def test_messages_reach_the_echo(ros_master: RosMaster, nodes):
 
 
 def test_a_latched_message_with_bytes(ros_master: RosMaster, nodes):
-    nodes(
-        publish(
-            ros_master, "/bytes", "rosbridge_library/TestUInt8", {"data": [1, 2, 255]}, count=1, latch=True
-        )
-    )
+    nodes(publish(ros_master, "/bytes", "rosbridge_library/TestUInt8", {"data": [1, 2, 255]}, count=1, latch=True))
     listener = nodes(echo(ros_master, "/bytes", "rosbridge_library/TestUInt8"))
     assert listener.wait_records("message") == [{"data": [1, 2, 255]}]
 
