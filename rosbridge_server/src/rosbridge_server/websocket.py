@@ -46,7 +46,8 @@ def main(argv: Optional[List[str]] = None) -> int:
         print(f"{_NAME}: {error}\n{usage(_NAME)}", file=sys.stderr)
         return 2
     # Until the loop takes the signals over, both end a start that may wait for a master for ever.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.default_int_handler)
     try:
         return _run(flags)
     except ModuleNotFoundError as error:
@@ -107,9 +108,8 @@ async def _serve(settings: Settings) -> int:
     ros_ended = threading.Event()
     rospy.core.add_shutdown_hook(lambda reason: ros_ended.set())  # the last one: rospy's own go before it
 
-    node = Node(
-        loop, Access.from_parameters(settings.topics_glob, settings.services_glob, settings.params_glob)
-    )
+    access = Access.from_parameters(settings.topics_glob, settings.services_glob, settings.params_glob)
+    node = Node(loop, access, settings.unregister_timeout)
     starting = loop.create_task(_start(settings, node))
     either: Set[asyncio.Future[Any]] = {starting, told_to_end}
     await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)

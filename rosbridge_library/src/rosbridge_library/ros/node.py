@@ -57,17 +57,21 @@ class TopicInfo(NamedTuple):
 class Node:
     """Feeds, publishers, services and the master, for one process. All methods are for the loop's thread."""
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, access: Optional[Access] = None) -> None:
+    def __init__(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        access: Optional[Access] = None,
+        unregister_timeout_s: float = DEFAULT_UNREGISTER_TIMEOUT_S,
+    ) -> None:
         self.loop = loop
         self.access = access or Access()
-        self.unregister_timeout_s = DEFAULT_UNREGISTER_TIMEOUT_S
         self.caller_id: str = rospy.get_name()
         self.master = Master(self.caller_id, timeout=MASTER_TIMEOUT_S)
         self._threads = ThreadPoolExecutor(CALL_THREADS, thread_name_prefix="ros-call")
         self._registrar = Registrar(self.master)
         self._handler = LoopTcprosHandler(loop)
         self.feeds = Feeds(loop, self._handler, self._registrar, self.now)
-        self.publishers = Publishers(loop, self._handler, self._registrar, lambda: self.unregister_timeout_s)
+        self.publishers = Publishers(loop, self._handler, self._registrar, unregister_timeout_s)
         self.services = ServiceCaller(self.call, self.master, self.caller_id)
         self.providers = ServiceProviders(self.call, self.master, self.caller_id)
         self._topic_lookup: Optional[asyncio.Task[_Graph]] = None

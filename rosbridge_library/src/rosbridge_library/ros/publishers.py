@@ -16,7 +16,7 @@ import asyncio
 import logging
 import struct
 from collections import deque
-from typing import TYPE_CHECKING, Callable, Deque, Dict, Hashable, Iterable, List, Optional, Set, Type
+from typing import TYPE_CHECKING, Deque, Dict, Hashable, Iterable, List, Optional, Set, Type
 
 import genpy
 from rospy.impl.registration import Registration, get_topic_manager
@@ -106,7 +106,7 @@ class Publishers:
         loop: asyncio.AbstractEventLoop,
         handler: LoopTcprosHandler,
         registrar: Registrar,
-        unregister_timeout_s: Callable[[], float],
+        unregister_timeout_s: float,
     ) -> None:
         self._loop = loop
         self._handler = handler
@@ -159,7 +159,7 @@ class Publishers:
         """`user` publishes no more. After the last one the publisher lingers for `unregister_timeout_s`."""
         publisher.users.discard(user)
         if not publisher.users and publisher.lingering is None and self._publishers.get(publisher.topic) is publisher:
-            publisher.lingering = self._loop.call_later(self._unregister_timeout_s(), self._close, publisher)
+            publisher.lingering = self._loop.call_later(self._unregister_timeout_s, self._close, publisher)
 
     def _close(self, publisher: Publisher) -> None:
         if publisher.lingering is not None:
