@@ -28,6 +28,11 @@ def _make_importable() -> None:
 
 _make_importable()
 
+# Before pytest makes packages of these names out of the folders that hold the tests.
+import rosapi  # noqa: E402, F401
+import rosbridge_library  # noqa: E402, F401
+import rosbridge_server  # noqa: E402, F401
+
 from support import bridge as bridges  # noqa: E402
 from support import process as processes  # noqa: E402
 from support.bridge import Bridge  # noqa: E402
