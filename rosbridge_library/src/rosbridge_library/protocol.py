@@ -132,7 +132,7 @@ class Protocol:
             return None
         if self._working is not None:
             self._waiting.append(message)
-            return asyncio.shield(self._working) if len(self._waiting) >= MAX_WAITING_OPERATIONS else None
+            return _ended(self._working) if len(self._waiting) >= MAX_WAITING_OPERATIONS else None
         pending = self._take(message)
         if pending is not None:
             self._working = self.loop.create_task(self._work(pending))
@@ -304,6 +304,11 @@ class Protocol:
                 capability.finish()
             except Exception:  # the others must be finished all the same
                 logger.exception("[client %s] finishing %s failed", self.client_id, type(capability).__name__)
+
+
+async def _ended(task: asyncio.Task[None]) -> None:
+    """Wait for `task`, however it ends."""
+    await asyncio.wait({task})
 
 
 class _CallOutgoing:

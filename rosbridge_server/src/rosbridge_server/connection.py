@@ -121,7 +121,9 @@ class WebSocketConnection(websocket.WebSocketProtocol13):
                     self._keepalive.heard()
                 unpaused += len(data)
                 for message in reader.feed(data):
-                    self._receive(message)
+                    busy = self._receive(message)
+                    if busy is not None:
+                        await busy  # what it sends meanwhile stays in its socket
                     unpaused += _MESSAGE_COST
                     if unpaused >= _YIELD_BYTES:
                         unpaused = 0
@@ -135,7 +137,8 @@ class WebSocketConnection(websocket.WebSocketProtocol13):
             self.close_code, self.close_reason = error.code, error.reason
             self.close(error.code, error.reason)
 
-    def _receive(self, message: framing.Message) -> None:
+    def _receive(self, message: framing.Message) -> Optional[asyncio.Future[None]]:
+        """Handle one message; what to wait for before the next, if anything."""
         opcode, data = message.opcode, message.data
         if opcode == framing.PING:
             self._send_pong(data)
@@ -147,7 +150,8 @@ class WebSocketConnection(websocket.WebSocketProtocol13):
         elif opcode != framing.PONG:
             if message.compressed:
                 data = self._inflate(data)
-            self._run_callback(self.handler.on_message, data)
+            return self._run_callback(self.handler.on_message, data)
+        return None
 
     def _inflate(self, data: bytes) -> bytes:
         assert self._decompressor is not None

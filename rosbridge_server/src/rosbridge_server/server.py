@@ -41,9 +41,9 @@ _GOING_AWAY, _POLICY_VIOLATION, _NORMAL = 1001, 1008, 1000
 
 class ClientProtocol(Protocol):
     """What speaks with one client. `incoming` gets the bytes of each message, and raises only because of a
-    bug."""
+    bug; what it returns is waited for before the client is read on."""
 
-    def incoming(self, message: Union[str, bytes]) -> None: ...
+    def incoming(self, message: Union[str, bytes]) -> Optional[Awaitable[None]]: ...
 
     def finish(self) -> None: ...
 
@@ -225,9 +225,8 @@ class ClientHandler(WebSocketHandler):
         self._protocol = make_protocol(self.client_id, server.parameters, outbox)
         server.connected(self)
 
-    def on_message(self, message: Union[str, bytes]) -> None:
-        if self._protocol is not None:
-            self._protocol.incoming(message)
+    def on_message(self, message: Union[str, bytes]) -> Optional[Awaitable[None]]:
+        return self._protocol.incoming(message) if self._protocol is not None else None
 
     def on_close(self) -> None:
         self.server.disconnected(self)
