@@ -267,6 +267,7 @@ def _pack_numbers(values: Sequence[Any], path: str, code: str) -> bytes:
     return struct.pack(f"<{len(values)}{code}", *converted)
 
 
+@np.errstate(invalid="ignore")
 def _cast_numbers(values: Any, path: str, code: str) -> bytes:
     """The same for a NumPy array, such as a CBOR typed array makes."""
     kind = values.dtype.kind
@@ -275,7 +276,7 @@ def _cast_numbers(values: Any, path: str, code: str) -> bytes:
         fits = np.full(len(values), kind == "b")
     elif code in "fd":
         fits = np.full(len(values), kind in "iuf")
-        if code == "f" and kind == "f":
+        if code == "f" and values.dtype == np.float64:
             fits &= ~(np.isfinite(values) & (np.abs(values) >= MAX_FLOAT32))
     elif kind in "iuf":
         low, high = INTEGER_RANGES[code]

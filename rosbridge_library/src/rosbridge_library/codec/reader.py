@@ -152,9 +152,18 @@ class _JsonReader(_Reader):
             return f"{view} != 0"
         if code == "f":
             # The digits of the double that a float32 is, as for a scalar, and as clients have always had them.
-            return f"{view}.astype(float64)"
+            return f"widened({view})"
         # orjson reads the memory as it is: a copy makes it aligned.
         return view if number_size(code) == 1 else f"{view}.copy()"
+
+
+@np.errstate(invalid="ignore")
+def _widened(values: Any) -> Any:
+    """float32 as float64; a signalling NaN is not worth the warning that NumPy has for it."""
+    return values.astype(_FLOAT64)
+
+
+_FLOAT64 = np.dtype("f8")
 
 
 def compile_values_reader(plan: Plan) -> Callable[[Any], Dict[str, Any]]:
@@ -181,7 +190,7 @@ def compile_json_pieces(plan: Plan) -> Callable[[Any], Tuple[bytes, ...]]:
 
 def _compile_json(plan: Plan, joined: bool) -> Callable[[Any], Any]:
     source = Source(f"{plan.name} to_json")
-    source.use(frombuffer=np.frombuffer, float64=np.dtype("f8"), base64_text=pybase64.b64encode_as_string)
+    source.use(frombuffer=np.frombuffer, widened=_widened, base64_text=pybase64.b64encode_as_string)
     source.use(base64=pybase64.b64encode, dumps=orjson.dumps, NUMPY=orjson.OPT_SERIALIZE_NUMPY)
     with walk_function(source, plan):
         reader = _JsonReader(source)
