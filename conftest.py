@@ -7,6 +7,7 @@ one says so with `@pytest.mark.allow_log("pattern", …)`. The output of every p
 
 from __future__ import annotations
 
+import importlib
 import sys
 from pathlib import Path
 from typing import Any, Callable, Iterator, List
@@ -18,12 +19,15 @@ SHOWN_BYTES = 6000
 
 
 def _make_importable() -> None:
-    """`support`, and the built packages unless the devel space was sourced already."""
+    """`support`, and the built packages unless the devel space was sourced already.
+
+    The packages are imported here because pytest would else take the directories of the same names, which it
+    passes on its way to the tests in them, for the packages."""
     sys.path.insert(0, str(ROOT / "test"))
-    try:
-        import rosbridge_msgs.msg  # noqa: F401
-    except ImportError:
+    if not any((Path(entry) / "rosbridge_msgs" / "__init__.py").exists() for entry in sys.path):
         sys.path[1:1] = [str(path) for path in (ROOT / "build" / "devel" / "lib").glob("python3*/dist-packages")]
+    for package in ("rosapi", "rosbridge_library", "rosbridge_server"):
+        importlib.import_module(package)
 
 
 _make_importable()
