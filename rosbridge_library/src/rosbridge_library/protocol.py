@@ -12,6 +12,7 @@ embed the library override.
 from __future__ import annotations
 
 import asyncio
+import functools
 import logging
 from collections import deque
 from typing import (
@@ -19,7 +20,6 @@ from typing import (
     Any,
     Awaitable,
     Callable,
-    Coroutine,
     Deque,
     Dict,
     List,
@@ -87,8 +87,8 @@ class Protocol:
         self.finished = False
         self._node = node
         self._waiting: Deque[Union[str, bytes]] = deque()
-        self._working: Optional[asyncio.Task[None]] = None
-        self._tasks: Set[asyncio.Task[None]] = set()
+        self._working: Optional[asyncio.Future[None]] = None  # what later operations wait for
+        self._tasks: Set[asyncio.Future[None]] = set()
 
     @property
     def node(self) -> Node:
@@ -133,34 +133,21 @@ class Protocol:
         if self._working is not None:
             self._waiting.append(message)
             return _ended(self._working) if len(self._waiting) >= MAX_WAITING_OPERATIONS else None
-        pending = self._take(message)
-        if pending is not None:
-            self._working = self.loop.create_task(self._work(pending))
+        self._working = self._take(message)
         return None
 
     async def _incoming_finished(self, message: Union[str, bytes]) -> None:
         self.incoming(message)
-        if self._working is not None:
-            await self._working
+        while self._working is not None:
+            await _ended(self._working)
 
-    def _take(self, message: Union[str, bytes]) -> Optional[Coroutine[Any, Any, None]]:
+    def _take(self, message: Union[str, bytes]) -> Optional[asyncio.Future[None]]:
         try:
             operation = self._decode(message)
         except DecodeError as error:
             self._report(error, {})
             return None
         return self.handle(operation)
-
-    async def _work(self, pending: Awaitable[None]) -> None:
-        """Finish one operation, and then those that came meanwhile."""
-        try:
-            await pending
-            while self._waiting:
-                more = self._take(self._waiting.popleft())
-                if more is not None:
-                    await more
-        finally:
-            self._working = None
 
     def _decode(self, message: Union[str, bytes]) -> Any:
         if isinstance(message, (bytes, bytearray, memoryview)):
@@ -171,15 +158,15 @@ class Protocol:
                 return decode_cbor(bytes(message))
         return decode_json(message)
 
-    def handle(self, operation: Any) -> Optional[Coroutine[Any, Any, None]]:
-        """Begin one decoded operation. Returns a coroutine when it isn't finished yet; neither raises."""
+    def handle(self, operation: Any) -> Optional[asyncio.Future[None]]:
+        """Begin one decoded operation. Returns what to wait for when it isn't finished yet. Never raises."""
         try:
             handler = self._handler(operation)
             pending = handler(operation)
         except Exception as error:  # noqa: BLE001  # reported, whatever it is
             self._report(error, operation)
             return None
-        return None if pending is None else self._finish_operation(pending, operation)
+        return None if pending is None else self.spawn(pending, operation)
 
     def _handler(self, operation: Any) -> Handler:
         if not isinstance(operation, dict):
@@ -199,17 +186,23 @@ class Protocol:
             raise InvalidArgumentException(f"unknown operation '{opcode[:100]}'; there are {known}")
         return handler
 
-    async def _finish_operation(self, pending: Awaitable[None], operation: Operation) -> None:
-        try:
-            await pending
-        except Exception as error:  # noqa: BLE001  # reported, whatever it is
-            self._report(error, operation)
+    def spawn(self, work: Awaitable[None], operation: Operation) -> asyncio.Future[None]:
+        """Go on with `operation`; what goes wrong is reported, and the work is cancelled when the client goes."""
+        task = asyncio.ensure_future(work, loop=self.loop)
+        if task not in self._tasks:
+            self._tasks.add(task)
+            task.add_done_callback(functools.partial(self._worked, operation))
+        return task
 
-    def spawn(self, work: Coroutine[Any, Any, None], operation: Operation) -> None:
-        """Go on with `operation` beside the client's next ones; cancelled when the client goes."""
-        task = self.loop.create_task(self._finish_operation(work, operation))
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+    def _worked(self, operation: Operation, task: asyncio.Future[None]) -> None:
+        self._tasks.discard(task)
+        error = None if task.cancelled() else task.exception()
+        if isinstance(error, Exception):
+            self._report(error, operation)
+        if task is self._working:
+            self._working = None
+            while self._waiting and self._working is None:
+                self._working = self._take(self._waiting.popleft())
 
     def _report(self, error: Exception, operation: Any) -> None:
         """Tell the client what went wrong. The one place that maps errors to what a client reads."""
@@ -296,9 +289,8 @@ class Protocol:
     def _finish_now(self) -> None:
         self.finished = True
         self._waiting.clear()
-        for task in (*self._tasks, self._working):
-            if task is not None:
-                task.cancel()
+        for task in self._tasks:
+            task.cancel()
         for capability in self.capabilities:
             try:
                 capability.finish()
@@ -306,7 +298,7 @@ class Protocol:
                 logger.exception("[client %s] finishing %s failed", self.client_id, type(capability).__name__)
 
 
-async def _ended(task: asyncio.Task[None]) -> None:
+async def _ended(task: asyncio.Future[None]) -> None:
     """Wait for `task`, however it ends."""
     await asyncio.wait({task})
 
