@@ -61,7 +61,7 @@ def test_header_of_a_service(live: Dict[str, str]) -> None:
 
 def test_not_provided(live: Dict[str, str]) -> None:
     uri = next(iter(live.values()))
-    with pytest.raises(ServiceRefused, match="/first.*is not a provider of.*/other"):
+    with pytest.raises(ServiceRefused, match=r"/first.*is not a provider of.*/other"):
         asyncio.run(probe_service(uri, "/other", "/test", 5.0))
 
 

@@ -87,9 +87,7 @@ class NodeApi:
             parameters, _ = xmlrpc.client.loads(answer, use_builtin_types=True)
             code, message, value = cast(Tuple[Any, ...], parameters[0])
         except xmlrpc.client.Fault as fault:
-            raise self.error(
-                f"{method} failed at {self.description} {self.uri}: {fault.faultString}"
-            ) from fault
+            raise self.error(f"{method} failed at {self.description} {self.uri}: {fault.faultString}") from fault
         except (xmlrpc.client.Error, ExpatError, ValueError, TypeError, LookupError) as error:
             raise self._unreachable(f"its answer to {method} is none of the ROS API") from error
         if code != 1:
