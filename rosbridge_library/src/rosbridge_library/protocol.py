@@ -50,7 +50,7 @@ __all__ = ["InvalidArgumentException", "MissingArgumentException", "Protocol"]
 logger = logging.getLogger("rosbridge.protocol")
 
 STATUS_LEVELS = {"none": 0, "error": 1, "warning": 2, "info": 3}
-_LOGGING_LEVELS = {"error": logging.WARNING, "warning": logging.INFO, "info": logging.DEBUG}
+_LOGGING_LEVELS = {"error": logging.WARNING, "warning": logging.DEBUG, "info": logging.DEBUG}
 
 MAX_WAITING_OPERATIONS = 64
 """How many operations may wait behind one that isn't finished before the connection should stop reading."""

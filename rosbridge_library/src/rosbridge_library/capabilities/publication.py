@@ -89,7 +89,9 @@ class Publications:
             if type_name is not None and ours.type.name != (await self._installed(type_name)).name:
                 raise TopicConflict(f"{name} is already advertised by clients as {ours.type.name}, not {type_name}")
             return ours.type
-        present = info.type if info is not None and self._used_by_others(info) else ""
+        present = self.node.publishers.type_in_rospy(name) or ""
+        if info is not None and self._used_by_others(info):
+            present = info.type
         if type_name is None:
             if not present:
                 raise TopicConflict(f"{name} does not exist, so it has no type: advertise it with one first")

@@ -39,7 +39,9 @@ _UINT32 = struct.Struct("<I")
 class Publisher:
     """One topic that clients publish. Made by `Publishers.open`."""
 
-    def __init__(self, topic: str, type_: MessageType, latch: bool, queue_size: int) -> None:
+    def __init__(
+        self, topic: str, type_: MessageType, latch: bool, queue_size: int, rospy_publisher: _PublisherImpl
+    ) -> None:
         self.topic = topic
         self.type = type_
         self.latch = latch
@@ -48,6 +50,7 @@ class Publisher:
         self.lingering: Optional[asyncio.TimerHandle] = None
         self.published_messages = 0
         self.published_bytes = 0
+        self._rospy = rospy_publisher
         self._seq = 0
         self._connections: List[OutboundConnection] = []
         self._latched: Optional[bytes] = None
@@ -73,6 +76,9 @@ class Publisher:
             self._missed.append(frame)
         for connection in list(self._connections):
             connection.send(frame)
+        for connection in self._rospy.connections:
+            if not isinstance(connection, OutboundConnection):  # this process publishes the topic itself: /rosout
+                connection.write_data(frame)
 
     def expect(self, subscribers: Iterable[str]) -> None:
         """Keep what is published for these nodes until they connect; `stop_expecting` ends it."""
@@ -121,6 +127,11 @@ class Publishers:
         """The publisher of `topic` (a global name), also while it outlives its last client."""
         return self._publishers.get(topic)
 
+    def type_in_rospy(self, topic: str) -> Optional[str]:
+        """The type of a topic that rospy itself publishes in this process (/rosout, client_count), or None."""
+        publisher = None if topic in self._publishers else get_topic_manager().get_publisher_impl(topic)
+        return None if publisher is None else str(publisher.data_class._type)
+
     def open(
         self,
         topic: str,
@@ -139,11 +150,11 @@ class Publishers:
             self._close(publisher)
             publisher = None
         if publisher is None:
-            publisher = self._publishers[topic] = Publisher(topic, type_, latch, queue_size)
+            rospy_publisher = _advertise(topic, _raw_class(type_), latch)
+            publisher = self._publishers[topic] = Publisher(topic, type_, latch, queue_size, rospy_publisher)
             publisher.expect(subscribers)
             self._loop.call_later(WARM_UP_S, publisher.stop_expecting)
             self._handler.outbound[topic] = publisher.attach
-            _advertise(topic, _raw_class(type_), latch)
         if publisher.lingering is not None:
             publisher.lingering.cancel()
             publisher.lingering = None
@@ -188,8 +199,8 @@ def _raw_class(type_: MessageType) -> Type[genpy.Message]:
     return RawMessage
 
 
-def _advertise(topic: str, data_class: Type[genpy.Message], latch: bool) -> None:
-    """What rospy.Publisher does, without waiting for the master."""
+def _advertise(topic: str, data_class: Type[genpy.Message], latch: bool) -> _PublisherImpl:
+    """What rospy.Publisher does, without waiting for the master. Another publisher in this process is joined."""
     topics = get_topic_manager()
     with topics.lock:
         publisher = topics.pubs.get(topic)
@@ -198,3 +209,4 @@ def _advertise(topic: str, data_class: Type[genpy.Message], latch: bool) -> None
             publisher.is_latch = latch
             topics._add(publisher, topics.pubs, Registration.PUB)
         publisher.ref_count += 1
+        return publisher
