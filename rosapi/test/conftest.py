@@ -25,8 +25,7 @@ PROGRAMS = Path(__file__).resolve().parent / "programs"
 def master_call() -> Iterator[Callable[..., Any]]:
     """`call(method, *arguments)` as Master.call has it; values pass through XML-RPC text both ways.
 
-    `call.log` lists the methods called so far; `call.handler` is the master, for calls in the name of other
-    nodes.
+    `call.log` lists the methods called so far; `call.handler` is the master, for calls in the name of other nodes.
     """
     handler = ROSMasterHandler()
     handler._ready("http://master:11311/")

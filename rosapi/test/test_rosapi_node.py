@@ -259,6 +259,9 @@ class TestBigGraph:
         assert len(services) >= 300
         assert len([node for node in nodes if node.startswith("/hung_")]) == 20
 
+        burst = [caller.answer(call_id) for call_id in [caller.ask("topics") for _ in range(50)]]
+        assert max(answer.took for answer in burst) < 1.0  # none of the connections was dropped and tried again
+
         slow = caller.ask("services_for_type", "std_srvs/Trigger")
         live = [caller.ask("service_type", f"/live/{name}") for name in ("empty", "trigger_5")]
         again = [caller.ask("services_for_type", "std_srvs/Trigger") for _ in range(10)]
@@ -365,6 +368,17 @@ class TestComingAndGoing:
             process.signal(number)
             assert process.wait(2.5) == 0
             assert "Traceback" not in process.output
+
+    @pytest.mark.parametrize("registered", [0, 1, 4, 15, 24])
+    def test_a_signal_ends_it_while_it_starts(self, tmp_path: Path, registered: int) -> None:
+        """When about that many services are registered."""
+        with RosMaster(tmp_path) as master, start_rosapi(master) as process:
+            wait_until(lambda: master.publishers("/rosout"), 15.0, lambda: process.output)
+            wait_until(lambda: len(master.call("getSystemState")[2]) >= registered, 15.0)
+            process.signal(signal.SIGTERM)
+            assert process.wait(4.0) == 0
+            assert "Traceback" not in process.output
+            assert master.call("getSystemState") == [[], [], []]
 
     def test_a_signal_ends_it_while_the_master_hangs(self, tmp_path: Path) -> None:
         with RosMaster(tmp_path) as master, rosapi(master) as process:

@@ -15,6 +15,7 @@ from functools import partial
 from typing import Any, Callable, Dict, Optional, TypeVar
 
 import rospy
+from rospy.impl.tcpros_base import init_tcpros_server
 
 from rosapi import msg, srv
 from rosapi.api import Api, Response
@@ -57,11 +58,13 @@ SERVICES: Dict[str, Any] = {
 
 GLOB_KINDS = ("topics", "services", "params")
 
-# A leaving node tells the master; one that hangs, or a host that can't be found, is waited for no longer than
-# this.
+# A leaving node tells the master. One that hangs is waited for no longer than this.
 LEAVE_WITHIN_S = 2.0
 
 MASTER_RETRY_S = 1.0
+
+# Each request of each web client is a connection; all pages that show a robot may load at once.
+WAITING_CONNECTIONS = 512
 
 T = TypeVar("T")
 
@@ -72,29 +75,46 @@ def main() -> int:
     leaving = threading.Event()
     rospy.on_shutdown(_leave_soon)
     rospy.on_shutdown(leaving.set)
+
+    def leave(number: int, frame: Any) -> None:
+        _leave_soon()
+        leaving.set()
+        if not rospy.core.is_initialized():
+            rospy.signal_shutdown(f"signal {number}")  # or else init_node goes on waiting for the master
+
     for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda number, frame: rospy.signal_shutdown(f"signal {number}"))
+        signal.signal(number, leave)
     try:
-        _patiently(lambda: Master("/rosapi").call("getPid"), leaving)
-        rospy.init_node("rosapi", disable_signals=True)
-        master = Master(rospy.get_name())
-        access = _patiently(lambda: read_access(master), leaving)
-    except _ToldToLeave:
-        return 0
-    except rospy.ROSInitException as error:
-        if leaving.is_set():
-            return 0
-        logger.error("can't start: %s", error)
-        return 1
-    Registrar(master).install()
+        _start(leaving)
+    except (_ToldToLeave, rospy.ROSInitException) as error:
+        if not leaving.is_set():
+            logger.error("can't start: %s", error)
+            return 1
+    leaving.wait()
+    rospy.signal_shutdown("told to leave")
+    while not rospy.is_shutdown():  # another thread is about it, because a node of the same name has started
+        rospy.rostime.wallsleep(0.05)
+    return 0
+
+
+def _start(leaving: threading.Event) -> None:
+    """Wait for the master, and offer all services. Raises ROSInitException, and _ToldToLeave when that comes first."""
+    _patiently(lambda: Master("/rosapi").call("getPid"), leaving)
+    rospy.init_node("rosapi", disable_signals=True)
+    master = Master(rospy.get_name())
+    access = _patiently(lambda: read_access(master), leaving)
     look_up = partial(look_up_services, master)
     probe = partial(probe_types, master.caller_id)
     api = Api(master.call, look_up, probe, rospy.Time.now, access)
     for name, service_type in SERVICES.items():
+        if leaving.is_set():
+            raise _ToldToLeave
         rospy.Service("~" + name, service_type, handler(getattr(api, name), service_type))
+    _accept_bursts()
+    registrar = Registrar(master)  # last: what it finds registered, it registers again when the master has lost it
+    registrar.install()
+    rospy.on_shutdown(registrar.close)
     logger.info("serving at %s", master.caller_id)
-    leaving.wait()
-    return 0
 
 
 def handler(answer: Callable[..., Response], service_type: Any) -> Callable[[Any], Any]:
@@ -141,6 +161,11 @@ def _patiently(ask: Callable[[], T], leaving: threading.Event) -> T:
 
 class _ToldToLeave(Exception):
     """A signal came before the node was up."""
+
+
+def _accept_bursts() -> None:
+    """Let many connections wait to be accepted: beyond rospy's five, the kernel drops one, and TCP takes a second."""
+    init_tcpros_server().tcp_ros_server.server_sock.listen(WAITING_CONNECTIONS)
 
 
 def _leave_soon() -> None:

@@ -37,8 +37,7 @@ class ParameterError(RosbridgeError):
 def to_json(value: Any) -> str:
     """A value from the parameter server as JSON text.
 
-    NaN and infinities are null, binary data (bytes) is base64, a date (datetime) is ISO 8601 text, keys are
-    text.
+    NaN and infinities are null, binary data (bytes) is base64, a date (datetime) is ISO 8601 text, keys are text.
     """
     return json.dumps(_jsonable(value), allow_nan=False)
 
@@ -60,8 +59,7 @@ def _jsonable(value: Any) -> Any:
 def from_json(text: str) -> Any:
     """The value that JSON `text` stands for, if the parameter server can hold it, else ParameterError.
 
-    Text without quotes is no JSON string and refused: to guess at `1e3` or `true` would set another type than
-    meant.
+    Text without quotes is no JSON string and refused: to guess at `1e3` or `true` would set another type than meant.
     """
     try:
         value = json.loads(text)
