@@ -64,9 +64,7 @@ class WebSocketConnection(websocket.WebSocketProtocol13):
     def start_pinging(self) -> None:
         """Overrides Tornado's, which can't have a timeout longer than the interval."""
         loop = asyncio.get_event_loop()
-        self._keepalive = KeepAlive(
-            loop, self._ping_interval, self._ping_timeout, self._send_ping, self._give_up
-        )
+        self._keepalive = KeepAlive(loop, self._ping_interval, self._ping_timeout, self._send_ping, self._give_up)
 
     def frame(self, payload: Payload) -> Tuple[Buffer, ...]:
         """The frame for ``payload``; shared between clients unless this one wants it compressed.

@@ -28,12 +28,8 @@ class _DroppingQueueHandler(logging.handlers.QueueHandler):
     def enqueue(self, record: logging.LogRecord) -> None:
         try:
             if self.lost:
-                text = (
-                    f"{self.lost} log lines before this one were lost: the log can't be written fast enough"
-                )
-                self.queue.put_nowait(
-                    logging.LogRecord(record.name, logging.WARNING, __file__, 0, text, (), None)
-                )
+                text = f"{self.lost} log lines before this one were lost: the log can't be written fast enough"
+                self.queue.put_nowait(logging.LogRecord(record.name, logging.WARNING, __file__, 0, text, (), None))
                 self.lost = 0
             self.queue.put_nowait(record)
         except queue.Full:

@@ -6,10 +6,11 @@ and is never dropped. Topic messages wait per source, and sources take turns in 
 a small state topic keeps its rate beside large images. A topic message is encoded when its turn comes, so one
 that is dropped never is.
 
-While fewer than ``burst_bytes`` wait nothing is dropped; above that each source keeps only its newest
-messages. What waits in all is bounded by ``max_bytes``. The transport is handed at most one batch at a time,
-and none while it still holds unsent bytes: what is queued here can still be dropped or overtaken, what is in
-the transport can't.
+While fewer than ``burst_bytes`` wait nothing is dropped. Above that the source that is furthest behind falls
+back to its newest messages (as many as it wants kept), until the client has caught up; then the next. So a
+topic of large images degrades before the small ones beside it lose anything. What waits in all is bounded by
+``max_bytes``. The transport is handed at most one batch at a time, and none while it still holds unsent
+bytes: what is queued here can still be dropped or overtaken, what is in the transport can't.
 
 When nothing waits, a message is encoded and written at once. Nothing here blocks, and nothing is a task.
 """
@@ -57,7 +58,7 @@ class _Lane:
     """What waits for one source: payloads of the message whose turn has come, then messages not encoded
     yet."""
 
-    __slots__ = ("begun", "bytes", "credit", "in_turn", "source", "waiting")
+    __slots__ = ("begun", "bytes", "credit", "extra", "in_turn", "keep", "newest_only", "source", "waiting")
 
     def __init__(self, source: Source) -> None:
         self.source = source
@@ -69,6 +70,28 @@ class _Lane:
         """Bytes it may send in this turn; negative after a message larger than that, to be made up for while
         others wait (when alone, there is nobody to make it up to)."""
         self.in_turn = False
+        self.keep = max(source.keep, 1)
+        self.extra = 0
+        """Bytes of the waiting messages that are not among the newest ``keep``."""
+        self.newest_only = False
+        """Drops the extra messages, until the client has caught up."""
+
+    def append(self, message: object, size: int) -> None:
+        self.waiting.append((message, size))
+        self.bytes += size
+        keep = max(self.source.keep, 1)
+        if keep != self.keep:
+            self.keep = keep
+            self.extra = sum(size for _, size in list(self.waiting)[:-keep])
+        elif len(self.waiting) > keep:
+            self.extra += self.waiting[-keep - 1][1]
+
+    def pop_oldest(self) -> Tuple[object, int]:
+        oldest = self.waiting.popleft()
+        self.bytes -= oldest[1]
+        if len(self.waiting) >= self.keep:
+            self.extra -= oldest[1]
+        return oldest
 
 
 class ClientOutbox:
@@ -100,6 +123,7 @@ class ClientOutbox:
         self._lanes: Dict[Source, _Lane] = {}
         self._turns: Deque[_Lane] = deque()
         self._topic_bytes = 0
+        self._behind: List[_Lane] = []  # the lanes with newest_only
         self._held = False  # the transport has unsent bytes
         self._pacing: Optional[Timer] = None
         self._writing = False
@@ -133,18 +157,16 @@ class ClientOutbox:
         lane = self._lanes.get(source)
         if lane is None:
             lane = self._lanes[source] = _Lane(source)
-        before = self._control_bytes + self._topic_bytes
-        lane.waiting.append((message, size))
-        lane.bytes += size
+        lane.append(message, size)
         self._topic_bytes += size
         if not lane.in_turn:
             lane.in_turn = True
             self._turns.append(lane)
-        if not self._pump() and before + size > self._burst_bytes:
-            # Crossing the bound trims all sources; after that only the one that grew needs it.
-            for crowded in list(self._lanes.values()) if before <= self._burst_bytes else (lane,):
-                while len(crowded.waiting) > max(crowded.source.keep, 1):
-                    self._drop_oldest(crowded)
+        if not self._pump():
+            if lane.newest_only:
+                self._keep_newest(lane)
+            if self._topic_bytes > self._burst_bytes:
+                self._limit_burst()
             self._shrink()
 
     def forget(self, source: Source) -> None:
@@ -153,7 +175,7 @@ class ClientOutbox:
         if lane is not None:
             self._topic_bytes -= lane.bytes
             lane.waiting.clear()
-            lane.bytes = 0
+            lane.bytes = lane.extra = 0
 
     def drained(self) -> None:
         """The transport has sent all that it held."""
@@ -232,11 +254,14 @@ class ClientOutbox:
             else:
                 turns.popleft()
                 lane.in_turn = False
+        if self._behind:  # and yet nothing waits: the client has caught up
+            for lane in self._behind:
+                lane.newest_only = False
+            self._behind.clear()
         return None
 
     def _encode_oldest(self, lane: _Lane) -> None:
-        message, size = lane.waiting.popleft()
-        lane.bytes -= size
+        message, size = lane.pop_oldest()
         self._topic_bytes -= size
         try:
             payloads = lane.source.encode(message)
@@ -249,9 +274,20 @@ class ClientOutbox:
 
     # What is dropped
 
+    def _limit_burst(self) -> None:
+        """Lets the sources that are furthest behind fall back to their newest messages."""
+        while sum(lane.extra for lane in self._lanes.values()) > self._burst_bytes:
+            lane = max(self._lanes.values(), key=lambda lane: lane.extra)
+            lane.newest_only = True
+            self._behind.append(lane)
+            self._keep_newest(lane)
+
+    def _keep_newest(self, lane: _Lane) -> None:
+        while len(lane.waiting) > lane.keep:
+            self._drop_oldest(lane)
+
     def _drop_oldest(self, lane: _Lane) -> None:
-        _, size = lane.waiting.popleft()
-        lane.bytes -= size
+        _, size = lane.pop_oldest()
         self._topic_bytes -= size
         topic = lane.source.topic
         self.dropped[topic] = self.dropped.get(topic, 0) + 1

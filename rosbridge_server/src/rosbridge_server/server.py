@@ -167,9 +167,7 @@ class ClientHandler(WebSocketHandler):
             return
         if headers.get("Origin") == "null" and not self.server.settings.websocket_null_origin:
             self.set_status(403)
-            self.finish(
-                "Clients with the origin null are not accepted here (websocket_null_origin is false).\n"
-            )
+            self.finish("Clients with the origin null are not accepted here (websocket_null_origin is false).\n")
             return
         # Everybody else is welcome. Tornado would compare these, and refuse what it can't parse before it
         # asks.
@@ -241,9 +239,7 @@ class ClientHandler(WebSocketHandler):
     def log_exception(self, typ: Any, value: Any, tb: Any) -> None:
         """Whatever is raised while a client is served is a bug; it ends that client alone."""
         if self.client_id:
-            logger.error(
-                "Client %s is closed because of an internal error", self.client_id, exc_info=(typ, value, tb)
-            )
+            logger.error("Client %s is closed because of an internal error", self.client_id, exc_info=(typ, value, tb))
         else:
             super().log_exception(typ, value, tb)
 
@@ -263,9 +259,7 @@ class ClientHandler(WebSocketHandler):
 
     def _lost(self) -> None:
         timeout = self.server.settings.websocket_ping_timeout
-        logger.warning(
-            "Client %s is closed: nothing came from it for %g s after a ping", self.client_id, timeout
-        )
+        logger.warning("Client %s is closed: nothing came from it for %g s after a ping", self.client_id, timeout)
 
     def _overflow(self, reason: str) -> None:
         logger.warning("Client %s is closed, since it does not read: %s", self.client_id, reason)

@@ -108,17 +108,11 @@ class Settings:
     certfile: Optional[str] = setting(None, _or_none(TEXT), "PEM certificate (chain) for ssl")
     keyfile: Optional[str] = setting(None, _or_none(TEXT), "PEM private key for ssl; None if certfile has it")
     retry_startup_delay: float = setting(5.0, SECONDS, "between attempts to listen, while the port is held")
-    fragment_timeout: float = setting(
-        600.0, SECONDS, "until the fragments of an incomplete message are dropped"
-    )
+    fragment_timeout: float = setting(600.0, SECONDS, "until the fragments of an incomplete message are dropped")
     delay_between_messages: float = setting(0.0, SECONDS, "least time between two messages to a client")
-    max_message_size: Optional[int] = setting(
-        None, _or_none(BYTES), "larger outgoing messages are fragmented"
-    )
+    max_message_size: Optional[int] = setting(None, _or_none(BYTES), "larger outgoing messages are fragmented")
     unregister_timeout: float = setting(10.0, SECONDS, "that a publisher lives on after its last client left")
-    websocket_external_port: Optional[int] = setting(
-        None, _or_none(PORT), "port that clients see, behind a proxy"
-    )
+    websocket_external_port: Optional[int] = setting(None, _or_none(PORT), "port that clients see, behind a proxy")
     use_compression: bool = setting(False, BOOLEAN, "offer permessage-deflate to clients")
     authenticate: bool = setting(False, BOOLEAN, "accept operations only after a rosauth authentication")
     websocket_ping_interval: float = setting(20.0, SECONDS, "between two pings to a client; 0 for none")
@@ -135,9 +129,7 @@ class Settings:
         Kind(_choice("default", "b64", "bson"), "default, b64 or bson"),
         "how uint8[] and char[] go out",
     )
-    default_call_service_timeout: float = setting(
-        30.0, SECONDS, "that a service call may take; 0 for any time"
-    )
+    default_call_service_timeout: float = setting(30.0, SECONDS, "that a service call may take; 0 for any time")
     max_incoming_size: int = setting(
         256 * MEBIBYTE, BYTES_OR_0, "a client that sends a larger message is closed; 0 for no limit"
     )

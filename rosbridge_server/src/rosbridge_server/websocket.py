@@ -65,9 +65,7 @@ def _run(flags: Mapping[str, Any]) -> int:
     from rosbridge_server.logs import route_to_ros
 
     if not rosgraph.is_master_online():
-        print(
-            f"{_NAME}: waiting for the ROS master at {rosgraph.get_master_uri()}", file=sys.stderr, flush=True
-        )
+        print(f"{_NAME}: waiting for the ROS master at {rosgraph.get_master_uri()}", file=sys.stderr, flush=True)
     rospy.init_node(_NAME, disable_signals=True)
     stop_logging = route_to_ros()
     try:
@@ -121,6 +119,9 @@ async def _serve(settings: Settings) -> int:
         except ListenError as error:
             logger.critical("%s", error)
             code = 1
+        except Exception:
+            logger.exception("The server could not be started")
+            code = 1
         else:
             logger.info("Shutting down: %s", await told_to_end)
     else:
@@ -131,8 +132,8 @@ async def _serve(settings: Settings) -> int:
 
 async def _start(settings: Settings, node: Node) -> WebSocketServer:
     import rospy
-    from rosbridge_library.rosbridge_protocol import RosbridgeProtocol
 
+    from rosbridge_library.rosbridge_protocol import RosbridgeProtocol
     from rosbridge_server.clients import Clients
     from rosbridge_server.server import WebSocketServer
 
