@@ -32,11 +32,6 @@ def _make_importable() -> None:
 
 _make_importable()
 
-# Before pytest makes packages of these names out of the folders that hold the tests.
-import rosapi  # noqa: E402, F401
-import rosbridge_library  # noqa: E402, F401
-import rosbridge_server  # noqa: E402, F401
-
 from support import bridge as bridges  # noqa: E402
 from support import process as processes  # noqa: E402
 from support.bridge import Bridge  # noqa: E402
@@ -65,7 +60,6 @@ def pytest_runtest_makereport(item: pytest.Item) -> Iterator[None]:
 @pytest.fixture(scope="module")
 def ros_master(tmp_path_factory: pytest.TempPathFactory) -> Iterator[RosMaster]:
     """A master for this module; it is empty when the module begins."""
-    del processes.started[:]  # of modules before
     with RosMaster(tmp_path_factory.mktemp("ros")) as master:
         yield master
 
@@ -124,6 +118,12 @@ def nodes() -> Iterator[Callable[[Node], Node]]:
         node.interrupt()  # all first: rospy takes its time to shut down
     for node in reversed(started):
         node.stop()
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _own_processes() -> None:
+    """A failure shows the processes of its own module alone."""
+    del processes.started[:]
 
 
 @pytest.fixture(autouse=True)
