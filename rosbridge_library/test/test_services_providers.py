@@ -388,6 +388,19 @@ def test_a_burst_of_callers(ros_master: RosMaster, node: Providing) -> None:
         assert time.monotonic() - begin < 2.5
 
 
+def test_a_peer_that_connects_and_says_nothing_blocks_nobody(ros_master: RosMaster, node: Providing) -> None:
+    name = fresh("silent")
+    node.advertise("silent", name, values={"sum": 5})
+    host, port = re.match(r"rosrpc://(.*):(\d+)", ros_master.call("lookupService", name)).groups()
+    with socket.create_connection((host, int(port))), socket.create_connection((host, int(port))) as half:
+        half.sendall(b"\xff")
+        begin = time.monotonic()
+        with Caller(ros_master, name) as caller:
+            caller.send(1, 2)
+            assert caller.sum() == 5
+        assert time.monotonic() - begin < 2.0
+
+
 def connected(sock: socket.socket) -> bool:
     try:
         sock.getpeername()

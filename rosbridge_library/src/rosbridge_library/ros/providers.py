@@ -20,21 +20,18 @@ from typing import Any, Awaitable, Callable, Coroutine, Dict, Mapping, Optional,
 from weakref import WeakValueDictionary
 
 import rospy
-from rospy.impl import tcpros_base
 from rospy.impl.registration import get_service_manager
 
 from rosbridge_library.codec import MessageType, ServiceType, get_service_type
 from rosbridge_library.internal.exceptions import RosbridgeError
 from rosbridge_library.names import checked_global_name
+from rosbridge_library.ros.accepting import relieve_accept_thread
 from rosbridge_library.ros.master import Master, MasterError, MasterUnreachable
 from rosbridge_library.ros.service_connection import ConnectionEnded, ServiceConnection
 
 logger = logging.getLogger("rosbridge.providers")
 
 MAX_REQUEST_BYTES = 256 * 1024 * 1024
-# rospy lets five connections wait for its accept thread; what a burst of callers brings beyond that the kernel
-# drops, and tries again after 1, 3, 7, 15 seconds.
-ACCEPT_QUEUE = 128
 CLOSING_S = 0.5
 
 Handler = Callable[[MessageType, bytes], Coroutine[Any, Any, bytes]]
@@ -272,8 +269,8 @@ class _RegisteredService:
         if get_service_manager().get_service(name) is not None:
             raise AdvertiseError(f"{name} is a service of the bridge itself")
         before, trouble = _present_provider(master, name)
+        relieve_accept_thread()
         self._ros_service = _HandingOverService(name, self._type, self._hand_over)
-        tcpros_base._tcpros_server.tcp_ros_server.server_sock.listen(ACCEPT_QUEUE)
         if before not in (None, self._ros_service.uri):
             return f"{name} was provided by the node at {before}; from now on it is provided by this client"
         return trouble
