@@ -111,17 +111,20 @@ class WebSocketConnection(websocket.WebSocketProtocol13):
 
     async def _receive_messages(self) -> None:
         reader = FrameReader(self.params.max_message_size, extensions=self._decompressor is not None)
+        keepalive = self._keepalive
+        assert keepalive is not None
         unpaused = 0
         try:
             while not self.client_terminated:
                 data = await self.stream.read_bytes(_READ_BYTES, partial=True)
-                if self._keepalive is not None:
-                    self._keepalive.heard()
+                keepalive.heard()
                 unpaused += len(data)
                 for message in reader.feed(data):
                     busy = self._receive(message)
                     if busy is not None:
-                        await busy  # what it sends meanwhile stays in its socket
+                        keepalive.pause()
+                        await busy
+                        keepalive.resume()
                     unpaused += _MESSAGE_COST
                     if unpaused >= _YIELD_BYTES:
                         unpaused = 0

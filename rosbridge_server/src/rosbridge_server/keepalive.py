@@ -17,7 +17,8 @@ class KeepAlive:
     """Calls ``ping()`` every ``interval`` seconds, and ``lost()`` once after ``timeout`` seconds of silence
     after one.
 
-    0 switches the pings, or the timeout, off. `heard` is to be called for everything that is received.
+    0 switches the pings, or the timeout, off. `heard` is to be called for everything that is received, and
+    `pause` when nothing is read for a while: what is not listened to can't be silent.
     """
 
     def __init__(
@@ -33,6 +34,7 @@ class KeepAlive:
         self._timeout = timeout
         self._ping = ping
         self._lost = lost
+        self._paused = False
         self._deadline: Optional[asyncio.TimerHandle] = None
         self._next: Optional[asyncio.TimerHandle] = None
         if interval > 0:
@@ -44,6 +46,15 @@ class KeepAlive:
             self._deadline.cancel()
             self._deadline = None
 
+    def pause(self) -> None:
+        """Nothing is read from now on."""
+        self.heard()
+        self._paused = True
+
+    def resume(self) -> None:
+        """What comes is read again."""
+        self._paused = False
+
     def stop(self) -> None:
         """No more pings, and `lost` is not called any more."""
         self.heard()
@@ -53,7 +64,7 @@ class KeepAlive:
 
     def _tick(self) -> None:
         self._next = self._loop.call_later(self._interval, self._tick)
-        if self._timeout > 0 and self._deadline is None:
+        if self._timeout > 0 and self._deadline is None and not self._paused:
             self._deadline = self._loop.call_later(self._timeout, self._give_up)
         self._ping()
 
