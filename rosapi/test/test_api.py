@@ -114,6 +114,11 @@ class TestEverythingAllowed:
         assert api.service_host("/base/stop") == {"host": "base"}
         assert api.service_providers("base/reset") == {"providers": ["/base"]}
 
+    @pytest.mark.parametrize(("uri", "host"), [("rosrpc://Robot1:40", "Robot1"), ("rosrpc://[::1]:40", "::1")])
+    def test_hosts_as_they_are_registered(self, api: Api, robot: Call, uri: str, host: str) -> None:
+        robot("registerService", "/base/stop", uri, "http://base:4000/")
+        assert api.service_host("/base/stop") == {"host": host}
+
     def test_providers_of_a_type(self, api: Api) -> None:
         assert api.service_providers("std_srvs/Trigger") == {"providers": ["/base", "/lidar"]}
         assert api.service_providers("std_srvs/SetBool") == {"providers": []}

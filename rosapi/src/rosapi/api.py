@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import re
 from typing import Any, Callable, Dict, List, Mapping, Sequence, Tuple
-from urllib.parse import urlsplit
 
 from rosapi import typedefs
 from rosapi.graph import Graph, action_servers, fetch_graph, names_with
@@ -50,7 +49,7 @@ class Api:
         self._access = access
         self._params = Params(call, access)
         self._graph: Recent[Graph] = Recent(lambda: fetch_graph(call), MAX_AGE_S)
-        self._uris: Recent[Mapping[str, str]] = Recent(lambda: look_up(self._graph.get().services()), MAX_AGE_S)
+        self._uris: Recent[Mapping[str, str]] = Recent(lambda: look_up(fetch_graph(call).services()), MAX_AGE_S)
         self._service_types = ServiceTypes(probe)
 
     # Topics.
@@ -96,7 +95,7 @@ class Api:
         return {"node": next(iter(self._providers(service)), "")}
 
     def service_host(self, service: str) -> Response:
-        return {"host": urlsplit(self._look_up(service)[1]).hostname or ""}
+        return {"host": _host(self._look_up(service)[1])}
 
     def service_providers(self, service: str) -> Response:
         """The nodes that provide the service of this name; or, as old clients ask, services of this type."""
@@ -177,8 +176,8 @@ class Api:
         return list(filter(self._access.may_call, self._graph.get().services()))
 
     def _services_of_type(self, type: str) -> List[str]:
-        uris = self._uris.get()
-        types = self._service_types.types({name: uris[name] for name in self._services() if name in uris})
+        uris = {name: uri for name, uri in self._uris.get().items() if self._access.may_call(name)}
+        types = self._service_types.types(uris)
         return sorted(name for name, kind in types.items() if kind == type)
 
     def _providers(self, service: str) -> Sequence[str]:
@@ -194,6 +193,11 @@ class Api:
             return name, str(self._call("lookupService", name))
         except MasterError:
             return name, ""
+
+
+def _host(uri: str) -> str:
+    """The host of rosrpc://host:port."""
+    return uri.partition("://")[2].rpartition(":")[0].strip("[]")
 
 
 def _definition_text(type: str) -> str:
