@@ -10,6 +10,8 @@ import asyncio
 import itertools
 from typing import Any, Dict, NamedTuple, Optional, Tuple
 
+from rospy.impl.registration import Registration
+
 from rosbridge_library.capabilities.publication import AccessDenied
 from rosbridge_library.capability import Operation
 from rosbridge_library.codec import MessageType
@@ -17,6 +19,7 @@ from rosbridge_library.encodings import service_call
 from rosbridge_library.internal.exceptions import InvalidArgumentException, RosbridgeError, ValuesError
 from rosbridge_library.names import checked_global_name
 from rosbridge_library.protocol import Protocol
+from rosbridge_library.ros.master import MasterUnreachable
 from rosbridge_library.ros.providers import Provider
 
 
@@ -54,6 +57,10 @@ class Provisions:
 
         provider = await node.providers.advertise(node.resolve(name), type_name, call_client)
         self._providers[service] = provider
+        try:
+            await node.registered(Registration.SRV, node.resolve(name))
+        except MasterUnreachable as error:
+            self._protocol.log("error", f"{error}; {service} will be advertised when it is back")
         return provider
 
     def unadvertise(self, service: str) -> bool:

@@ -7,7 +7,9 @@ Publishing on a topic that was not advertised advertises it, if its type is know
 
 from __future__ import annotations
 
-from typing import Dict, Hashable, Optional, Set
+from typing import Dict, Hashable, List, Optional, Set
+
+from rospy.impl.registration import Registration
 
 from rosbridge_library.codec import MessageType, get_message_type
 from rosbridge_library.internal.exceptions import RosbridgeError
@@ -67,13 +69,24 @@ class Publications:
             self._protocol,
             latch,
             DEFAULT_QUEUE_SIZE if queue_size is None else queue_size,
-            [] if info is None else info.subscribers,
+            self._subscribers(name, info),
         )
         self._publishers[topic] = publisher
         self._ids.setdefault(topic, set()).add(advertise_id)
         if info is not None:
-            await self.node.publishers.registered(publisher)
+            await self._register(name)
         return publisher
+
+    async def _register(self, name: str) -> None:
+        try:
+            await self.node.registered(Registration.PUB, name)
+        except MasterUnreachable as error:
+            self._protocol.log("error", f"{error}; {name} will be advertised when it is back")
+
+    def _subscribers(self, name: str, info: Optional[TopicInfo]) -> List[str]:
+        """The nodes that subscribe to a topic: this one too, from before the master knows of it."""
+        ours = [] if self.node.feeds.get(name) is None else [self.node.caller_id]
+        return ours if info is None else info.subscribers + ours
 
     async def _look_up(self, name: str) -> Optional[TopicInfo]:
         """What the master says, or None, with the client told, while it is away."""

@@ -25,8 +25,9 @@ from rospy.impl.registration import Registration, get_topic_manager
 
 from rosbridge_library.access import Access
 from rosbridge_library.internal.exceptions import RosbridgeError
+from rosbridge_library.ros.accepting import relieve_accept_thread
 from rosbridge_library.ros.feeds import Feeds
-from rosbridge_library.ros.master import Master
+from rosbridge_library.ros.master import Master, MasterUnreachable
 from rosbridge_library.ros.providers import ServiceProviders
 from rosbridge_library.ros.publishers import Publishers
 from rosbridge_library.ros.registrar import Registrar
@@ -71,13 +72,14 @@ class Node:
         self._registrar = Registrar(self.master)
         self._handler = LoopTcprosHandler(loop)
         self.feeds = Feeds(loop, self._handler, self._registrar, self.now)
-        self.publishers = Publishers(loop, self._handler, self._registrar, unregister_timeout_s)
+        self.publishers = Publishers(loop, self._handler, unregister_timeout_s)
         self.services = ServiceCaller(self.call, self.master, self.caller_id)
         self.providers = ServiceProviders(self.call, self.master, self.caller_id)
         self._topic_lookup: Optional[asyncio.Task[_Graph]] = None
 
     async def start(self) -> None:
         """Take rospy's place at the topic sockets and at the master. Raises RuntimeError before rospy.init_node."""
+        relieve_accept_thread()
         self._registrar.install()
         rospy.impl.tcpros._handler = self._handler
         rospy.impl.tcpros_base._tcpros_server.topic_connection_handler = self._handler.topic_connection_handler
@@ -86,7 +88,7 @@ class Node:
         for topic, subscriber in list(get_topic_manager().subs.items()):
             for connection in list(subscriber.connections):
                 connection.close()
-            self._registrar.settled(Registration.SUB, topic)
+            self._registrar.renew(Registration.SUB, topic)
 
     async def stop(self) -> None:
         """End every feed, publisher and provided service. Doesn't wait for the master."""
@@ -109,6 +111,18 @@ class Node:
         except asyncio.TimeoutError:
             name = getattr(function, "__name__", str(function))
             raise RosTimeout(f"no answer to {name} within {timeout:g} s") from None
+
+    async def registered(self, kind: str, name: str) -> None:
+        """Wait until the master knows a publisher ("pub") or service ("srv") of this node.
+
+        Raises MasterError when it refuses, MasterUnreachable when it takes too long; it is told when it is back.
+        """
+        settled = asyncio.wrap_future(self._registrar.settled(kind, name))
+        try:
+            await asyncio.wait_for(settled, MASTER_TIMEOUT_S)
+        except asyncio.TimeoutError:
+            reason = self._registrar.trouble or f"the master did not register {name} within {MASTER_TIMEOUT_S:g} s"
+            raise MasterUnreachable(reason) from None
 
     @staticmethod
     def now() -> Tuple[int, int]:

@@ -16,7 +16,7 @@ import asyncio
 import logging
 import struct
 from collections import deque
-from typing import TYPE_CHECKING, Deque, Dict, Hashable, Iterable, List, Optional, Set, Type
+from typing import Deque, Dict, Hashable, Iterable, List, Optional, Set, Type
 
 import genpy
 from rospy.impl.registration import Registration, get_topic_manager
@@ -24,9 +24,6 @@ from rospy.topics import _PublisherImpl
 
 from rosbridge_library.codec import MessageType
 from rosbridge_library.ros.tcpros import LoopTcprosHandler, OutboundConnection
-
-if TYPE_CHECKING:
-    from rosbridge_library.ros.registrar import Registrar
 
 logger = logging.getLogger("rosbridge.publishers")
 
@@ -111,12 +108,10 @@ class Publishers:
         self,
         loop: asyncio.AbstractEventLoop,
         handler: LoopTcprosHandler,
-        registrar: Registrar,
         unregister_timeout_s: float,
     ) -> None:
         self._loop = loop
         self._handler = handler
-        self._registrar = registrar
         self._unregister_timeout_s = unregister_timeout_s
         self._publishers: Dict[str, Publisher] = {}
 
@@ -161,10 +156,6 @@ class Publishers:
         publisher.users.add(user)
         publisher.queue_size = max(publisher.queue_size, queue_size)
         return publisher
-
-    async def registered(self, publisher: Publisher) -> None:
-        """Wait until the master knows the publisher. Raises MasterError when it refuses."""
-        await asyncio.wrap_future(self._registrar.settled(Registration.PUB, publisher.topic))
 
     def leave(self, publisher: Publisher, user: Hashable) -> None:
         """`user` publishes no more. After the last one the publisher lingers for `unregister_timeout_s`."""

@@ -16,7 +16,7 @@ from __future__ import annotations
 import logging
 import threading
 from concurrent.futures import Future
-from typing import Callable, Dict, List, NamedTuple, Optional, Set
+from typing import Dict, List, NamedTuple, Optional, Set, Union
 
 from rospy.impl.registration import (
     Registration,
@@ -52,6 +52,7 @@ class Registrar(RegistrationListener):  # type: ignore[misc]  # rospy has no typ
         self._changed = threading.Condition()
         self._wanted: Dict[Entry, str] = {}  # topic type, or service uri
         self._stale: Set[Entry] = set()  # removed, or added anew, since the thread last looked
+        self._peers: Dict[Entry, List[str]] = {}  # what the master answered to each registration
         self._waiting: Dict[Entry, List[Future[List[str]]]] = {}
         self._closed = False
         self._known: Dict[Entry, str] = {}  # what the master has been told; the thread's own
@@ -99,10 +100,17 @@ class Registrar(RegistrationListener):  # type: ignore[misc]  # rospy has no typ
         future: Future[List[str]] = Future()
         entry = Entry(kind, name)
         with self._changed:
-            self._waiting.setdefault(entry, []).append(future)
-            self._stale.add(entry)
-            self._changed.notify()
+            if entry in self._peers:
+                future.set_result(self._peers[entry])
+            else:
+                self._waiting.setdefault(entry, []).append(future)
         return future
+
+    def renew(self, kind: str, name: str) -> None:
+        """Register again what is registered: rospy then connects to a topic's publishers anew."""
+        with self._changed:
+            self._stale.add(Entry(kind, name))
+            self._changed.notify()
 
     # rospy's listener interface, called under rospy's locks: must not block.
 
@@ -110,6 +118,7 @@ class Registrar(RegistrationListener):  # type: ignore[misc]  # rospy has no typ
         entry = Entry(reg_type, resolved_name)
         with self._changed:
             self._wanted[entry] = data_type_or_uri
+            self._peers.pop(entry, None)
             self._stale.add(entry)
             self._changed.notify()
 
@@ -119,6 +128,7 @@ class Registrar(RegistrationListener):  # type: ignore[misc]  # rospy has no typ
             if reg_type == Registration.SRV and self._wanted.get(entry) != data_type_or_uri:
                 return  # an older provider of a name that has been taken over
             self._wanted.pop(entry, None)
+            self._peers.pop(entry, None)
             self._stale.add(entry)
             waiting = self._waiting.pop(entry, [])
             self._changed.notify()
@@ -175,10 +185,9 @@ class Registrar(RegistrationListener):  # type: ignore[misc]  # rospy has no typ
                 peers = []
         except MasterError as error:
             logger.error("the master refuses %s %s: %s", entry.kind, entry.name, error)
-            reason = error  # the name ends with the except clause
-            self._settle(entry, lambda future: future.set_exception(reason))
+            self._settle(entry, error)
         else:
-            self._settle(entry, lambda future: future.set_result(list(peers)))
+            self._settle(entry, list(peers))
         self._known[entry] = type_or_uri
 
     def _unregister(self, entry: Entry, type_or_uri: str) -> None:
@@ -194,12 +203,20 @@ class Registrar(RegistrationListener):  # type: ignore[misc]  # rospy has no typ
             logger.warning("the master refuses to forget %s %s: %s", entry.kind, entry.name, error)
         del self._known[entry]
 
-    def _settle(self, entry: Entry, finish: Callable[[Future[List[str]]], None]) -> None:
+    def _settle(self, entry: Entry, outcome: Union[List[str], MasterError]) -> None:
         with self._changed:
+            if entry in self._stale:
+                return  # removed or added anew meanwhile
+            if not isinstance(outcome, MasterError):
+                self._peers[entry] = outcome
             waiting = self._waiting.pop(entry, [])
         for future in waiting:
-            if future.set_running_or_notify_cancel():
-                finish(future)
+            if not future.set_running_or_notify_cancel():
+                continue
+            if isinstance(outcome, MasterError):
+                future.set_exception(outcome)
+            else:
+                future.set_result(outcome)
 
     def _troubled(self, reason: str) -> None:
         if self.trouble is None:

@@ -66,9 +66,14 @@ class LoopTcprosHandler(TCPROSHandler):  # type: ignore[misc]  # rospy has no ty
         subscriber = get_topic_manager().get_subscriber_impl(resolved_name)
         if subscriber is None:
             return 0, f"no longer subscribed to {resolved_name}", 0
-        connection = InboundConnection(self, subscriber, (host, port), pub_uri)
-        if not subscriber.add_connection(connection):
-            return 0, f"no longer subscribed to {resolved_name}", 0
+        with subscriber.c_lock:
+            # rospy asks twice, at once, when the master names a publisher in two messages; rospy's own rule, that the
+            # newer connection replaces the older, would lose what the older has read.
+            if subscriber.has_connection(pub_uri):
+                return 1, f"{resolved_name} is connected to {pub_uri} already", port
+            connection = InboundConnection(self, subscriber, (host, port), pub_uri)
+            if not subscriber.add_connection(connection):
+                return 0, f"no longer subscribed to {resolved_name}", 0
         self.loop.call_soon_threadsafe(connection.start)
         return 1, f"connecting {resolved_name} to {host}:{port}", port
 
