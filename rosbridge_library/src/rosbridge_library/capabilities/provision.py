@@ -100,9 +100,11 @@ class Provisions:
         request = self._requests.get(str(message.get("id")))
         if request is None or request.answered.done():
             raise InvalidArgumentException(f"no call of {message.get('service')} waits for the id {message.get('id')}")
-        values = message.get("values")
-        if values is None and message.get("result") is False:
-            request.answered.set_exception(ClientFailed(f"the client that provides {request.service} says it failed"))
+        values, result = message.get("values"), message.get("result")
+        # roslib 2 answers with neither when the callback returned nothing.
+        if (values is None and result is not True) or (isinstance(values, str) and result is False):
+            reason = f"the client that provides {request.service} says it failed" + (f": {values}" if values else "")
+            request.answered.set_exception(ClientFailed(reason))
             return
         try:
             wire, missing = self._response(request, values)

@@ -18,9 +18,7 @@ class ServiceResponse(Capability):
     service_response_msg_fields = (
         (False, "service", str),
         (True, "id", (str, int)),
-        (False, "values", (dict, list, str)),
-        (False, "result", bool),
-    )
+    )  # values and result are looked at where the caller that waits is told what is wrong with them
 
     def __init__(self, protocol: Protocol) -> None:
         super().__init__(protocol)
