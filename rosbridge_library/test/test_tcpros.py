@@ -205,6 +205,7 @@ def outbound(check: Callable[[OutboundConnection, socket.socket], Awaitable[None
         connection = OutboundConnection(loop, _Publisher(), sock, address, {"callerid": "/listener"})
         connection.start(lambda _: None)
         try:
+            await _read_frame(subscriber)  # the header
             await asyncio.wait_for(check(connection, subscriber), 20.0)
         finally:
             connection.close()

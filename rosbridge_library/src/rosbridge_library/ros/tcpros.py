@@ -25,7 +25,7 @@ from collections import deque
 from typing import Any, Callable, Deque, Dict, List, Optional, Tuple
 
 import rospy
-from rosgraph.network import use_ipv6, write_ros_handshake_header
+from rosgraph.network import use_ipv6
 from rospy.impl.registration import get_topic_manager
 from rospy.impl.tcpros_base import TCPROS, TCPROSTransport
 from rospy.impl.tcpros_pubsub import TCPROSHandler, TCPROSPub, TCPROSSub
@@ -96,7 +96,6 @@ class LoopTcprosHandler(TCPROSHandler):  # type: ignore[misc]  # rospy has no ty
             )
         connection = OutboundConnection(self.loop, publisher, sock, client_addr, header)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        write_ros_handshake_header(sock, connection.protocol.get_header_fields())
         publisher.add_connection(connection)
         self.loop.call_soon_threadsafe(connection.start, attach)
         return None
@@ -402,19 +401,25 @@ class OutboundConnection(_LoopTransport):
         self.dropped = 0
 
     def start(self, attach: Callable[[OutboundConnection], None]) -> None:
-        """Begin to watch the socket; `attach` gives the connection to its publisher."""
+        """Answer the handshake and watch the socket; `attach` gives the connection to its publisher.
+
+        All in one turn of the loop: what is published once the subscriber knows that it is connected, it gets.
+        """
         if self.done:
             self._drop_socket()
             return
         self.socket.setblocking(False)
         self.loop.add_reader(self.socket, self._readable)
+        self._transmit(encode_header(self.protocol.get_header_fields()))
         attach(self)
 
     def send(self, frame: bytes) -> None:
         """Send one message with its length in front, or queue it."""
-        if self.socket is None:
-            return
-        self.stat_num_msg += 1
+        if self.socket is not None:
+            self.stat_num_msg += 1
+            self._transmit(frame)
+
+    def _transmit(self, frame: bytes) -> None:
         if self._queue:
             self._enqueue(memoryview(frame))
             return
