@@ -29,12 +29,15 @@ if TYPE_CHECKING:
     from rosbridge_library.protocol import Protocol
 
 COMPRESSIONS = ("none", "png", "cbor", "cbor-raw")
+MAX_THROTTLE_RATE_MS = 1e12
+MAX_HELD_BYTES = 64 * 1024 * 1024
+"""How much a throttle may hold back for one subscription."""
 
 
 class Wishes(NamedTuple):
     """What one subscribe operation asks for."""
 
-    throttle_rate_ms: int = 0
+    throttle_rate_ms: float = 0
     queue_length: int = 0
     fragment_size: Optional[int] = None
     compression: str = "none"
@@ -55,15 +58,18 @@ class Stream(Sink):
         self._compression = "none"
         self._fragment_size: Optional[int] = None
         self._interval_s = 0.0
-        self._held: Deque[Message] = deque(maxlen=1)
-        self._timer: Optional[asyncio.TimerHandle] = None
+        self._held: Deque[Message] = deque()
+        self._held_bytes = 0
+        self._timer: Optional[asyncio.TimerHandle] = None  # while it runs, messages are held back
+        self._sent_at_s = 0.0  # on the loop's clock, which is monotonic
         self._told: Optional[str] = None  # the last trouble that the client was told of
 
-    def ask(self, subscription_id: Hashable, wishes: Wishes) -> None:
-        """Add a subscription, or change the wishes of one."""
-        self.wishes.pop(subscription_id, None)  # what was asked last comes last
+    def ask(self, subscription_id: Hashable, wishes: Wishes) -> bool:
+        """Add a subscription, or change the wishes of one; whether it is a new one."""
+        before = self.wishes.pop(subscription_id, None)  # what was asked last comes last
         self.wishes[subscription_id] = wishes
         self._reckon()
+        return before is None
 
     def take_back(self, subscription_id: Hashable) -> bool:
         """Remove a subscription; False when there is none of this id."""
@@ -82,15 +88,17 @@ class Stream(Sink):
         self._fragment_size = self._protocol.fragment_size(min(sizes) if sizes else None)
         asked = [each.compression for each in every if each.compression != "none"]
         self._compression = self._protocol.encoding(asked[-1] if asked else "none")
-        if self._held.maxlen != self.keep:
-            self._held = deque(self._held, maxlen=self.keep)
+        self._drop_oldest()
         if not self._interval_s:
             self._release()
+        elif self._timer is not None:
+            self._wait()  # the interval may end sooner, or later
 
     def close(self) -> None:
         """No more messages go to the client."""
         self.feed.remove(self)
         self._held.clear()
+        self._held_bytes = 0
         if self._timer is not None:
             self._timer.cancel()
         self._protocol.outbox.forget(self)
@@ -107,8 +115,9 @@ class Stream(Sink):
         elif self._timer is None:
             self._offer_and_wait(message)
         else:
-            self.throttled += len(self._held) == self._held.maxlen
             self._held.append(message)
+            self._held_bytes += len(message.wire)
+            self._drop_oldest()
 
     def deliver_latched(self, message: Message) -> None:
         if self._is_expected(message):
@@ -121,13 +130,19 @@ class Stream(Sink):
 
     def _offer_and_wait(self, message: Message) -> None:
         self._protocol.outbox.offer(self, message, len(message.wire))
-        self._timer = self._protocol.loop.call_later(self._interval_s, self._interval_over)
+        self._sent_at_s = self._protocol.loop.time()
+        self._wait()
+
+    def _wait(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = self._protocol.loop.call_at(self._sent_at_s + self._interval_s, self._interval_over)
 
     def _interval_over(self) -> None:
         """The head of what was held back goes out when the interval ends, so that a topic never goes stale."""
         self._timer = None
         if self._held:
-            self._offer_and_wait(self._held.popleft())
+            self._offer_and_wait(self._next_held())
 
     def _release(self) -> None:
         """The throttle is gone: so is its reason to hold anything back."""
@@ -135,8 +150,19 @@ class Stream(Sink):
             self._timer.cancel()
             self._timer = None
         while self._held:
-            message = self._held.popleft()
+            message = self._next_held()
             self._protocol.outbox.offer(self, message, len(message.wire))
+
+    def _next_held(self) -> Message:
+        message = self._held.popleft()
+        self._held_bytes -= len(message.wire)
+        return message
+
+    def _drop_oldest(self) -> None:
+        """Hold back no more than was asked for, nor than is good for the server; the newest message stays."""
+        while len(self._held) > 1 and (len(self._held) > self.keep or self._held_bytes > MAX_HELD_BYTES):
+            self._next_held()
+            self.throttled += 1
 
     def _is_expected(self, message: Message) -> bool:
         if self.type_name is None or message.type.name == self.type_name:
@@ -199,7 +225,8 @@ class Subscribe(Capability):
             return self._open(self.protocol.node.resolve(name), type_name, wishes, message)
         if type_name is not None and stream.type_name not in (None, type_name):
             raise TopicConflict(f"{topic} is already subscribed to as {stream.type_name}, not {type_name}")
-        stream.ask(message.get("id"), wishes)
+        if stream.ask(message.get("id"), wishes):
+            stream.feed.replay(stream)  # the part of a page that came later waits for the map, too
         self.protocol.spawn(self._confirm(stream, message), message)
         return None
 
@@ -209,6 +236,8 @@ class Subscribe(Capability):
             raise TopicConflict(f"{name} has type {present}, not {type_name}")
         if not present:
             await self._tell_what_is_awaited(name, type_name, message)
+        if self.protocol.finished:
+            return
         topic = message["topic"]
         feed = self.protocol.node.feeds.open(name, present or type_name)
         stream = self._streams[topic] = Stream(self.protocol, topic, feed, type_name)
@@ -274,10 +303,10 @@ def _wishes(message: Operation) -> Wishes:
     queue_length = message.get("queue_length") or 0
     fragment_size = message.get("fragment_size")
     compression = message.get("compression") or "none"
-    if throttle_rate < 0 or queue_length < 0:
+    if not 0 <= throttle_rate < float("inf") or queue_length < 0:
         raise InvalidArgumentException("the fields 'throttle_rate' and 'queue_length' must not be negative")
     if fragment_size is not None and fragment_size < 1:
         raise InvalidArgumentException("the field 'fragment_size' must be 1 or more")
     if compression not in COMPRESSIONS:
         raise InvalidArgumentException(f"the field 'compression' must be one of {', '.join(COMPRESSIONS)}")
-    return Wishes(int(throttle_rate), queue_length, fragment_size, compression)
+    return Wishes(min(throttle_rate, MAX_THROTTLE_RATE_MS), queue_length, fragment_size, compression)

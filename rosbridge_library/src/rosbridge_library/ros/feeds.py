@@ -69,6 +69,7 @@ class Feed(Receiver):
         self._refused: Dict[str, str] = {}  # publisher uri: why
         self._changed = asyncio.Event()
         self._live: Optional[asyncio.Task[List[str]]] = None
+        self._was_live = False
         self.received_messages = 0
         self.received_bytes = 0
 
@@ -84,9 +85,13 @@ class Feed(Receiver):
 
     def add(self, sink: Sink) -> None:
         """Give `sink` the latched messages, once each, and all that comes from now on."""
+        self.replay(sink)
+        self._sinks += (sink,)
+
+    def replay(self, sink: Sink) -> None:
+        """Give `sink` the latched messages, once each."""
         for message in list(self._latched.values()):
             sink.deliver_latched(message)
-        self._sinks += (sink,)
 
     def remove(self, sink: Sink) -> None:
         """Give `sink` nothing more; ends the feed when it was the last. A sink that isn't there is left alone."""
@@ -99,13 +104,18 @@ class Feed(Receiver):
 
         While the master is away this waits for it.
         """
-        if self._live is None:
+        if self._live is None or self._live.done():
             self._live = self._feeds.loop.create_task(self._become_live())
         return await asyncio.shield(self._live)
 
     async def _become_live(self) -> List[str]:
-        uris = await asyncio.wrap_future(self._feeds.registrar.settled(Registration.SUB, self.topic))
-        publishers = set(uris)
+        settled = asyncio.wrap_future(self._feeds.registrar.settled(Registration.SUB, self.topic))
+        # Once live it stays so: later, the master is only asked whether publishers have come or died since.
+        await asyncio.wait({settled}, timeout=LIVE_TIMEOUT_S if self._was_live else None)
+        if not settled.done():
+            settled.cancel()
+            return [f"the master does not say who publishes {self.topic} now: {self._feeds.registrar.trouble}"]
+        publishers = set(settled.result())
         deadline = self._feeds.loop.time() + LIVE_TIMEOUT_S
         while True:
             waiting = publishers - self._connected() - set(self._refused)
@@ -119,6 +129,7 @@ class Feed(Receiver):
                 break
         if publishers:
             await asyncio.sleep(ADDED_BY_PUBLISHER_S)
+        self._was_live = True
         return [
             f"the publisher at {uri} of {self.topic} can't be reached: {self._refused.get(uri, 'it does not answer')}"
             for uri in sorted(publishers - self._connected())
