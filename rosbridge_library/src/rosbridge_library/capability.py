@@ -29,13 +29,33 @@ from rosbridge_library.internal.exceptions import InvalidArgumentException, Miss
 if TYPE_CHECKING:
     from rosbridge_library.protocol import Protocol
 
-__all__ = ["Capability", "InvalidArgumentException", "MissingArgumentException", "Operation", "on_loop"]
+__all__ = [
+    "Capability",
+    "InvalidArgumentException",
+    "MissingArgumentException",
+    "Operation",
+    "OperationId",
+    "checked_id",
+    "on_loop",
+]
 
 Operation = Dict[str, Any]
 """One decoded message from a client: its `op` and the other fields."""
 
+OperationId = Union[str, int, float, None]
+
 FieldType = Union[Type[Any], Tuple[Type[Any], ...]]
 C = TypeVar("C", bound="Capability")
+
+
+def checked_id(message: Operation) -> OperationId:
+    """The `id` of an operation, or None. Raises InvalidArgumentException for what can't be one, and can't come back."""
+    value = message.get("id")
+    if value is None or isinstance(value, (str, float)):
+        return value
+    if isinstance(value, int) and not isinstance(value, bool) and -(1 << 63) <= value < 1 << 64:
+        return value
+    raise InvalidArgumentException("the field 'id' must be a string or a number")
 
 
 class Capability:
@@ -54,8 +74,10 @@ class Capability:
     def basic_type_check(self, msg: Operation, types_info: Iterable[Tuple[bool, str, FieldType]]) -> None:
         """Check fields of `msg` against (mandatory, name, type or tuple of types). null counts as left out.
 
+        The `id`, which every operation may have, is checked too.
         Raises MissingArgumentException or InvalidArgumentException. True and False are no numbers here.
         """
+        checked_id(msg)
         for mandatory, field, types in types_info:
             value = msg.get(field)
             if value is None:

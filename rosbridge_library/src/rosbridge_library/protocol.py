@@ -30,7 +30,7 @@ from typing import (
     Union,
 )
 
-from rosbridge_library.capability import Capability, Operation
+from rosbridge_library.capability import Capability, Operation, OperationId, checked_id
 from rosbridge_library.codec import decode_cbor, decode_json
 from rosbridge_library.encodings import encode_operation, in_fragments
 from rosbridge_library.internal.exceptions import (
@@ -54,6 +54,12 @@ _LOGGING_LEVELS = {"error": logging.WARNING, "warning": logging.DEBUG, "info": l
 
 MAX_WAITING_OPERATIONS = 64
 """How many operations may wait behind one that isn't finished before the connection should stop reading."""
+
+FINISH_TIMEOUT_S = 2.0
+"""How long what a client sent before it left may take to be published."""
+
+# What a client that is gone wanted all the same: a script publishes, and closes its connection.
+_OUTLIVING = ("advertise", "publish", "unadvertise", "fragment", "png")
 
 Handler = Callable[[Operation], Optional[Awaitable[None]]]
 
@@ -85,10 +91,15 @@ class Protocol:
         self.capabilities: List[Capability] = []
         self.shared: Dict[str, object] = {}  # what capabilities of this client have in common, by name
         self.finished = False
+        """The client is gone: nothing more comes from it or goes to it."""
+        self.ended = False
+        """And what it began is taken back: nothing may begin any more."""
         self._node = node
         self._waiting: Deque[Union[str, bytes]] = deque()
         self._working: Optional[asyncio.Future[None]] = None  # what later operations wait for
+        self._working_on = ""  # its opcode
         self._tasks: Set[asyncio.Future[None]] = set()
+        self._ending: Optional[asyncio.TimerHandle] = None
 
     @property
     def node(self) -> Node:
@@ -162,11 +173,16 @@ class Protocol:
         """Begin one decoded operation. Returns what to wait for when it isn't finished yet. Never raises."""
         try:
             handler = self._handler(operation)
+            if self.finished and operation["op"] not in _OUTLIVING:
+                return None
             pending = handler(operation)
         except Exception as error:  # noqa: BLE001  # reported, whatever it is
             self._report(error, operation)
             return None
-        return None if pending is None else self.spawn(pending, operation)
+        if pending is None:
+            return None
+        self._working_on = operation["op"]
+        return self.spawn(pending, operation)
 
     def _handler(self, operation: Any) -> Handler:
         if not isinstance(operation, dict):
@@ -178,8 +194,6 @@ class Protocol:
             raise MissingArgumentException("the field 'op' is missing")
         if not isinstance(opcode, str):
             raise InvalidArgumentException(f"the field 'op' must be str, not {type(opcode).__name__}")
-        if isinstance(operation.get("id"), (dict, list, bool)):
-            raise InvalidArgumentException("the field 'id' must be a string or a number")
         handler = self.operations.get(opcode)
         if handler is None:
             known = ", ".join(sorted(self.operations))
@@ -203,10 +217,12 @@ class Protocol:
             self._working = None
             while self._waiting and self._working is None:
                 self._working = self._take(self._waiting.popleft())
+            if self.finished and self._working is None:
+                self._end()
 
     def _report(self, error: Exception, operation: Any) -> None:
         """Tell the client what went wrong. The one place that maps errors to what a client reads."""
-        opcode, lid = (operation.get("op"), operation.get("id")) if isinstance(operation, dict) else (None, None)
+        opcode, lid = (operation.get("op"), _id_of(operation)) if isinstance(operation, dict) else (None, None)
         what = f"{opcode[:100]}: " if isinstance(opcode, str) else ""
         if isinstance(error, RosbridgeError):
             self.log("error", what + str(error), lid)
@@ -251,7 +267,7 @@ class Protocol:
 
     # Status messages, section 3.2 of the specification
 
-    def log(self, level: str, message: str, lid: Union[str, int, None] = None) -> None:
+    def log(self, level: str, message: str, lid: OperationId = None) -> None:
         """Log `message`, and send it to the client when it asked for `level`; `lid` is the id of what caused it."""
         about = f" [id: {lid}]" if lid is not None else ""
         logger.log(_LOGGING_LEVELS[level], "[client %s]%s %s", self.client_id, about, message)
@@ -260,23 +276,26 @@ class Protocol:
             self.send(status if lid is None else {**status, "id": lid})
 
     def _set_level(self, message: Operation) -> None:
-        level = message.get("level")
+        level, lid = message.get("level"), checked_id(message)
         if not isinstance(level, str) or level not in STATUS_LEVELS:
             raise InvalidArgumentException(f"the field 'level' must be one of {', '.join(STATUS_LEVELS)}")
         self.status_level = level
-        self.log("info", f"status level is now {level}", message.get("id"))
+        self.log("info", f"status level is now {level}", lid)
 
     def _status(self, message: Operation) -> None:
         """A status that the client sends is its log line."""
         level = message.get("level")
-        if level not in _LOGGING_LEVELS:
+        if not isinstance(level, str) or level not in _LOGGING_LEVELS:
             level = "info"
         logger.log(_LOGGING_LEVELS[level], "[client %s] says: %s", self.client_id, str(message.get("msg", ""))[:1000])
 
     # The end
 
     def finish(self) -> None:
-        """The client is gone: end everything that it began. Doing so again does nothing."""
+        """The client is gone: end everything that it began. Doing so again does nothing.
+
+        What it sent to be published before it left is published first, for FINISH_TIMEOUT_S at most.
+        """
         if asyncio._get_running_loop() is not self.loop:
             asyncio.run_coroutine_threadsafe(self._finish(), self.loop).result()
         elif not self.finished:
@@ -285,9 +304,26 @@ class Protocol:
     async def _finish(self) -> None:
         if not self.finished:
             self._finish_now()
+        while self._working is not None:
+            await _ended(self._working)
 
     def _finish_now(self) -> None:
         self.finished = True
+        outlives = self._working is not None and self._working_on in _OUTLIVING
+        for task in self._tasks:
+            if not outlives or task is not self._working:
+                task.cancel()
+        if outlives or (self._working is not None and self._waiting):
+            self._ending = self.loop.call_later(FINISH_TIMEOUT_S, self._end)
+        else:
+            self._end()
+
+    def _end(self) -> None:
+        if self.ended:
+            return
+        self.ended = True
+        if self._ending is not None:
+            self._ending.cancel()
         self._waiting.clear()
         for task in self._tasks:
             task.cancel()
@@ -318,6 +354,14 @@ class _CallOutgoing:
 
     def forget(self, source: Source) -> None:
         """Nothing waits here."""
+
+
+def _id_of(operation: Operation) -> OperationId:
+    """The id to answer with: none where what the client gave can't be one."""
+    try:
+        return checked_id(operation)
+    except InvalidArgumentException:
+        return None
 
 
 def _decode_bson(data: bytes) -> Any:

@@ -42,6 +42,9 @@ class Advertise(Capability):
         publisher = await publications(self.protocol).advertise(
             topic, message["type"], lid, bool(message.get("latch")), message.get("queue_size")
         )
+        if message.get("latch") and not publisher.latch:
+            reason = f"{topic} does not latch: others advertised it without"
+            self.protocol.log("warning", f"advertise: {reason}", lid)
         self.protocol.log("info", f"advertise: {topic} is advertised as {publisher.type.name}", lid)
 
     @on_loop

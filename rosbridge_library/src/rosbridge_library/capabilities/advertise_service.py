@@ -29,7 +29,7 @@ class AdvertiseService(Capability):
 
     async def _advertise(self, message: Operation) -> None:
         service, lid = message["service"], message.get("id")
-        provider = await provisions(self.protocol).advertise(service, message["type"])
+        provider = await provisions(self.protocol).advertise(service, message["type"], lid)
         if provider.warning:
             self.protocol.log("warning", f"advertise_service: {provider.warning}", lid)
         self.protocol.log("info", f"advertise_service: {service} is provided as {provider.type.name}", lid)

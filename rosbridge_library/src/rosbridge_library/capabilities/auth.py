@@ -20,4 +20,5 @@ class Auth(Capability):
 
     def auth(self, message: Operation) -> None:
         """Accept any credentials."""
+        self.basic_type_check(message, ())
         self.protocol.log("info", "auth: authentication is off; everybody may connect", message.get("id"))

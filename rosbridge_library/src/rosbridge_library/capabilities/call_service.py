@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Optional, Tuple
 
 from rosbridge_library.capabilities.publication import AccessDenied
-from rosbridge_library.capability import Capability, Operation, on_loop
+from rosbridge_library.capability import Capability, Operation, OperationId, checked_id, on_loop
 from rosbridge_library.encodings import service_response
 from rosbridge_library.internal.exceptions import InvalidArgumentException, RosbridgeError
 from rosbridge_library.names import checked_global_name
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from rosbridge_library.protocol import Protocol
 
 COMPRESSIONS = ("none", "png", "cbor")
+MAX_TIMEOUT_S = 1e9
 
 
 class CallService(Capability):
@@ -55,7 +56,6 @@ class CallService(Capability):
     async def _call_and_respond(self, message: Operation) -> None:
         self.basic_type_check(message, self.call_service_msg_fields)
         compression, fragment_size, timeout_s = _wishes(message)
-        # The old form "/service#id": what follows the # only comes back in the response.
         name = checked_global_name(message["service"].split("#", 1)[0], "service")
         if not self.protocol.node.access.may_call(name):
             raise AccessDenied(f"the server does not let clients call {name}")
@@ -70,7 +70,7 @@ class CallService(Capability):
             self.protocol.log(
                 "warning",
                 f"call_service: fields left out were filled with defaults: {left_out}",
-                message.get("id"),
+                _call_id(message),
             )
         envelope = {**_envelope(message), "result": True}
         payload = service_response(reply.type, reply.wire, envelope, self.protocol.encoding(compression))
@@ -81,9 +81,21 @@ class CallService(Capability):
 
 
 def _envelope(message: Operation) -> Operation:
-    """`service` and `id` as the client wrote them."""
-    envelope = {"op": "service_response", "service": message.get("service")}
-    return envelope if message.get("id") is None else {**envelope, "id": message["id"]}
+    """`service` and `id` as the client wrote them, whatever they are, as far as a reply can hold them."""
+    service = message.get("service")
+    envelope: Operation = {"op": "service_response", "service": service if isinstance(service, str) else ""}
+    lid = _call_id(message)
+    return envelope if lid is None else {**envelope, "id": lid}
+
+
+def _call_id(message: Operation) -> OperationId:
+    """The id of a call; in the old form "/service#id" it is what follows the #."""
+    try:
+        lid = checked_id(message)
+    except InvalidArgumentException:
+        return None
+    service = message.get("service")
+    return service.partition("#")[2] or None if lid is None and isinstance(service, str) else lid
 
 
 def _wishes(message: Operation) -> Tuple[str, Optional[int], Optional[float]]:
@@ -96,4 +108,6 @@ def _wishes(message: Operation) -> Tuple[str, Optional[int], Optional[float]]:
     timeout_s = message.get("timeout")
     if timeout_s is not None and not 0 <= timeout_s < float("inf"):
         raise InvalidArgumentException("the field 'timeout' must be a number of seconds, or 0 for none")
+    if timeout_s is not None:
+        timeout_s = min(timeout_s, MAX_TIMEOUT_S)
     return compression, fragment_size, timeout_s

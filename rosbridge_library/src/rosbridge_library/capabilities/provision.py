@@ -12,8 +12,8 @@ from typing import Any, Dict, NamedTuple, Optional, Tuple
 
 from rospy.impl.registration import Registration
 
-from rosbridge_library.capabilities.publication import AccessDenied
-from rosbridge_library.capability import Operation
+from rosbridge_library.capabilities.publication import AccessDenied, ClientGone
+from rosbridge_library.capability import Operation, OperationId
 from rosbridge_library.codec import MessageType
 from rosbridge_library.encodings import service_call
 from rosbridge_library.internal.exceptions import InvalidArgumentException, RosbridgeError, ValuesError
@@ -42,7 +42,7 @@ class Provisions:
         self._requests: Dict[str, _Request] = {}
         self._numbers = itertools.count(1)
 
-    async def advertise(self, service: str, type_name: str) -> Provider:
+    async def advertise(self, service: str, type_name: str, lid: OperationId = None) -> Provider:
         """Provide `service`; what is already provided under this name by this client is replaced.
 
         Raises InvalidArgumentException, AccessDenied, TypeLoadError, AdvertiseError.
@@ -56,11 +56,14 @@ class Provisions:
             return await self._call_client(service, type_, provider.type.response, wire)
 
         provider = await node.providers.advertise(node.resolve(name), type_name, call_client)
+        if self._protocol.finished:
+            provider.unadvertise(f"the client that provides {service} has disconnected")
+            raise ClientGone(f"the client is gone; {service} is not provided by it")
         self._providers[service] = provider
         try:
             await node.registered(Registration.SRV, node.resolve(name))
         except MasterUnreachable as error:
-            self._protocol.log("error", f"{error}; {service} will be advertised when it is back")
+            self._protocol.log("error", f"{error}; {service} will be advertised when it is back", lid)
         return provider
 
     def unadvertise(self, service: str) -> bool:

@@ -11,6 +11,7 @@ from typing import Dict, Hashable, List, Optional, Set
 
 from rospy.impl.registration import Registration
 
+from rosbridge_library.capability import OperationId
 from rosbridge_library.codec import MessageType, get_message_type
 from rosbridge_library.internal.exceptions import RosbridgeError
 from rosbridge_library.names import checked_global_name
@@ -19,9 +20,15 @@ from rosbridge_library.ros.master import MasterUnreachable
 from rosbridge_library.ros.node import Node, RosTimeout, TopicInfo
 from rosbridge_library.ros.publishers import DEFAULT_QUEUE_SIZE, Publisher
 
+MAX_QUEUE_SIZE = 2**31 - 1
+
 
 class TopicConflict(RosbridgeError):
     """A topic has another type, or none that is known."""
+
+
+class ClientGone(RosbridgeError):
+    """The client has left before what it asked for could begin."""
 
 
 class AccessDenied(RosbridgeError):
@@ -49,7 +56,7 @@ class Publications:
         self,
         topic: str,
         type_name: Optional[str],
-        advertise_id: Hashable,
+        advertise_id: OperationId,
         latch: bool,
         queue_size: Optional[int],
     ) -> Publisher:
@@ -61,39 +68,48 @@ class Publications:
         if not self.node.access.may_publish(name):
             raise AccessDenied(f"the server does not let clients publish {topic}")
         name = self.node.resolve(name)
-        info = await self._look_up(name)
+        info = await self._look_up(name, advertise_id)
         type_ = await self._type(name, type_name, info)
+        self._may_still_open(name, type_)
         publisher = self.node.publishers.open(
             name,
             type_,
             self._protocol,
             latch,
-            DEFAULT_QUEUE_SIZE if queue_size is None else queue_size,
+            DEFAULT_QUEUE_SIZE if queue_size is None else min(queue_size, MAX_QUEUE_SIZE),
             self._subscribers(name, info),
         )
         self._publishers[topic] = publisher
         self._ids.setdefault(topic, set()).add(advertise_id)
         if info is not None:
-            await self._register(name)
+            await self._register(name, advertise_id)
         return publisher
 
-    async def _register(self, name: str) -> None:
+    async def _register(self, name: str, lid: OperationId) -> None:
         try:
             await self.node.registered(Registration.PUB, name)
         except MasterUnreachable as error:
-            self._protocol.log("error", f"{error}; {name} will be advertised when it is back")
+            self._protocol.log("error", f"{error}; {name} will be advertised when it is back", lid)
 
     def _subscribers(self, name: str, info: Optional[TopicInfo]) -> List[str]:
         """The nodes that subscribe to a topic: this one too, from before the master knows of it."""
         ours = [] if self.node.feeds.get(name) is None else [self.node.caller_id]
         return ours if info is None else info.subscribers + ours
 
-    async def _look_up(self, name: str) -> Optional[TopicInfo]:
+    def _may_still_open(self, name: str, type_: MessageType) -> None:
+        """Raise for what has changed while the master was asked."""
+        if self._protocol.ended:
+            raise ClientGone(f"the client is gone; {name} is not advertised for it")
+        ours = self.node.publishers.get(name)
+        if ours is not None and ours.users and ours.type.name != type_.name:
+            raise TopicConflict(f"{name} is already advertised by clients as {ours.type.name}, not {type_.name}")
+
+    async def _look_up(self, name: str, lid: OperationId) -> Optional[TopicInfo]:
         """What the master says, or None, with the client told, while it is away."""
         try:
             return await self.node.topic(name)
         except (MasterUnreachable, RosTimeout) as error:
-            self._protocol.log("error", f"{error}; {name} will be advertised when it is back")
+            self._protocol.log("error", f"{error}; {name} will be advertised when it is back", lid)
             return None
 
     async def _type(self, name: str, type_name: Optional[str], info: Optional[TopicInfo]) -> MessageType:
@@ -106,6 +122,8 @@ class Publications:
         if info is not None and self._used_by_others(info):
             present = info.type
         if type_name is None:
+            if info is not None:
+                present = present or info.type  # of a client that waits for it
             if not present:
                 raise TopicConflict(f"{name} does not exist, so it has no type: advertise it with one first")
             return await self._installed(present)
