@@ -65,9 +65,10 @@ class _Caller:
 
 
 def run(pipe: Pipe, url: str, encoding: str, service: str, clients: int) -> None:
-    """A worker. Replies when every client had an answer. Commands: a Window to count in; "finish", whose reply is the
-    tally; latencies are from call to response."""
+    """A worker. Commands: "start", whose reply says that every client had an answer; a Window to count in; "finish",
+    whose reply is the tally; latencies are from call to response."""
     tally = Tally()
+    pipe.recv()
     callers = [_Caller(url, encoding, service) for _ in range(clients)]
     for caller in callers:
         caller.call()

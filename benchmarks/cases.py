@@ -42,8 +42,9 @@ def all_cases() -> List[Case]:
 
 def quick_cases() -> List[Case]:
     """One case of each kind: whether everything works, not how fast."""
-    topics = [_topic("twist2000", "json", 1), _topic("scan", "cbor-raw", 2), _topic("tf", "cbor", 1)]
-    others = [case for case in _other_cases(idle_clients=20) if case.encoding != "foxglove" and case.clients != 10]
+    chosen = (("twist2000", "json", 1), ("scan", "cbor-raw", 2), ("tf", "cbor", 1), ("image", "foxglove", 2))
+    topics = [_topic(load, encoding, clients) for load, encoding, clients in chosen]
+    others = [case for case in _other_cases(idle_clients=20) if case.clients != 10]
     return [*topics, *others]
 
 

@@ -55,10 +55,11 @@ def foxglove_entry(connection: Connection, op: str, entries: str, field: str, na
 
 
 def run(pipe: Pipe, url: str, load_name: str, encoding: str, topic: str, clients: int) -> None:
-    """A worker. Replies when every client has had a message. Commands: a Window to count in; "finish", whose reply is
-    the tally once nothing more comes."""
+    """A worker. Commands: "start", whose reply says that every client has had a message; a Window to count in;
+    "finish", whose reply is the tally once nothing more comes."""
     tally = Tally()
     find = finder(load_name, encoding)
+    pipe.recv()
     counters: List[MessageCounter] = []
     with selectors.DefaultSelector() as selector:
         selector.register(pipe, selectors.EVENT_READ, None)

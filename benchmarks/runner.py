@@ -101,32 +101,34 @@ class Runner:
 
     def _topic(self, case: Case, server: Running) -> Result:
         topic = self._new_name()
-        with Worker(publisher.run, case.load, case.rate_hz, topic, self._master_uri) as source:
-            source.reply()
-            with Worker(clients.run, server.url, case.load, case.encoding, topic, case.clients) as sink:
-                sink.reply()
-                result = self._window(case, server, [source, sink], [source, sink])
-                sent, received = source.ask("stop"), sink.ask("finish")
-        return {"message_bytes": message_bytes(case.load), **result, **self._delivery(result, sent, received, case)}
+        source = Worker(publisher.run, case.load, case.rate_hz, topic, self._master_uri)
+        sink = Worker(clients.run, server.url, case.load, case.encoding, topic, case.clients)
+        return {"message_bytes": message_bytes(case.load), **self._stream(case, server, source, sink)}
 
     def _publish(self, case: Case, server: Running) -> Result:
         topic = self._new_name()
-        with Worker(sender.run, server.url, case.encoding, topic, case.rate_hz) as source:
+        source = Worker(sender.run, server.url, case.encoding, topic, case.rate_hz)
+        sink = Worker(subscriber.run, sender.LOAD, topic, self._master_uri)
+        return {"message_bytes": message_bytes(sender.LOAD), **self._stream(case, server, source, sink)}
+
+    def _stream(self, case: Case, server: Running, source: Worker, sink: Worker) -> Result:
+        """What comes out at `sink` of what goes in at `source`."""
+        with source, sink:
             source.reply()
-            with Worker(subscriber.run, sender.LOAD, topic, self._master_uri) as sink:
-                sink.reply()
-                result = self._window(case, server, [source, sink], [source, sink])
-                sent, received = source.ask("stop"), sink.ask("finish")
-        return {"message_bytes": message_bytes(sender.LOAD), **result, **self._delivery(result, sent, received, case)}
+            sink.ask("start")
+            result = self._window(case, server, [source, sink], [source, sink])
+            sent, received = source.ask("stop"), sink.ask("finish")
+        return {**result, **_losses(case, sent, received), **_figures(result, received)}
 
     def _service(self, case: Case, server: Running) -> Result:
         service = self._new_name()
-        with Worker(provider.run, service, self._master_uri) as source:
+        source = Worker(provider.run, service, self._master_uri)
+        sink = Worker(callers.run, server.url, case.encoding, service, case.clients)
+        with source, sink:
             source.reply()
-            with Worker(callers.run, server.url, case.encoding, service, case.clients) as sink:
-                sink.reply()
-                result = self._window(case, server, [source, sink], [sink])
-                received = sink.ask("finish")
+            sink.ask("start")
+            result = self._window(case, server, [source, sink], [sink])
+            received = sink.ask("finish")
         return {**result, **_figures(result, received)}
 
     def _idle(self, case: Case, server: Running) -> Result:
@@ -187,17 +189,6 @@ class Runner:
             result["other_cpu_percent"] = round(max(0.0, 100 * others_s / seconds), 1)
         return result
 
-    def _delivery(self, usage_: Result, sent: Result, received: Result, case: Case) -> Result:
-        expected = sent["sent"] * case.clients
-        loss = 1 - received["stamped"] / expected if expected else None
-        figures = _figures(usage_, received)
-        return {
-            "sent": sent["sent"],
-            "publisher_dropped": sent["dropped"],
-            "loss": None if loss is None else round(loss, 5),
-            **figures,
-        }
-
     def _new_name(self) -> str:
         """A topic or service that nobody has used."""
         return f"/benchmark/{time.time_ns():x}_{next(self._numbers)}"
@@ -222,6 +213,12 @@ def run_all(runner: Runner, cases: Sequence[Case], candidates: Sequence[Candidat
     for case in cases:
         for candidate in candidates:
             yield runner.run(case, candidate)
+
+
+def _losses(case: Case, sent: Result, received: Result) -> Result:
+    expected = sent["sent"] * case.clients
+    loss = round(1 - received["stamped"] / expected, 5) if expected else None
+    return {"sent": sent["sent"], "publisher_dropped": sent["dropped"], "loss": loss}
 
 
 def _figures(usage_: Result, received: Result) -> Result:

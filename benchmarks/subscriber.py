@@ -23,9 +23,10 @@ _DRAIN_S = 0.5
 
 
 def run(pipe: Pipe, load_name: str, topic: str, master_uri: str) -> None:
-    """A worker. Waits until somebody publishes the topic, and replies at the first message. Commands: a Window to
-    count in; "finish", whose reply is the tally."""
+    """A worker. Commands: "start", whose reply says that somebody publishes the topic and a message has come; a Window
+    to count in; "finish", whose reply is the tally."""
     load = LOADS[load_name]
+    pipe.recv()
     node = RosNode("/benchmark_subscriber", master_uri)
     connection = _connect(node, topic, load.type)
     stream = _Stream(connection, stamp_offset(load))
