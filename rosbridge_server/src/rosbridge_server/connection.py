@@ -34,6 +34,7 @@ their turn."""
 _MESSAGE_COST = 1024
 
 _INVALID_DATA = 1007
+_LAST_SILENCE_S = 0.5
 
 
 class WebSocketConnection(websocket.WebSocketProtocol13):
@@ -99,15 +100,23 @@ class WebSocketConnection(websocket.WebSocketProtocol13):
         try:
             await self._receive_messages()
             if not self.client_terminated:
-                # The client broke a rule and was told so: it gets the time to read that, while what it sends
-                # is thrown away (closing the socket on unread data would reset it, and the close frame be
-                # lost).
-                while True:
-                    await self.stream.read_bytes(_READ_BYTES, partial=True)
+                await self._discard()
         except StreamClosedError:
             self._abort()
         finally:
             self.handler.on_ws_connection_close(self.close_code, self.close_reason)
+
+    async def _discard(self) -> None:
+        """Gives a client that broke a rule the time to read why; what it sends meanwhile is thrown away.
+
+        Closing a socket with unread data resets the connection, and the close frame would be lost.
+        """
+        while True:
+            read = asyncio.ensure_future(self.stream.read_bytes(_READ_BYTES, partial=True))
+            await asyncio.wait({read}, timeout=_LAST_SILENCE_S)
+            if not read.done():
+                self._abort()
+            await read
 
     async def _receive_messages(self) -> None:
         reader = FrameReader(self.params.max_message_size, extensions=self._decompressor is not None)

@@ -92,7 +92,8 @@ class FrameReader:
             if len(buffer) < self._end:
                 return
             head, start, end = buffer[0], self._start, self._end
-            body = _websocket_mask(bytes(buffer[start - 4 : start]), bytes(buffer[start:end]))
+            with memoryview(buffer) as view:
+                body = _websocket_mask(bytes(view[start - 4 : start]), bytes(view[start:end]))
             del buffer[:end]
             self._end = 0
             message = self._message(head, body)

@@ -120,8 +120,9 @@ async def _serve(settings: Settings) -> int:
             logger.critical("%s", error)
             code = 1
         except Exception:
-            logger.exception("The server could not be started")
-            code = 1
+            if not rospy.is_shutdown():  # told to end while it started: no wonder then, whatever went wrong
+                logger.exception("The server could not be started")
+                code = 1
         else:
             logger.info("Shutting down: %s", await told_to_end)
     else:
