@@ -96,7 +96,7 @@ class Node:
         self.publishers.close_all()
         await self.providers.close()
         await self.services.close()
-        self._registrar.close()
+        await self.loop.run_in_executor(None, self._registrar.close)
         self._threads.shutdown(wait=False)
 
     async def call(self, function: Callable[..., T], *args: Any, timeout: Optional[float] = MASTER_TIMEOUT_S) -> T:

@@ -32,6 +32,7 @@ from rosbridge_library.ros.master import Master, MasterError, MasterUnreachable
 logger = logging.getLogger("rosbridge.registrar")
 
 CHECK_INTERVAL_S = 1.0
+CLOSE_TIMEOUT_S = 0.5
 
 
 class Entry(NamedTuple):
@@ -86,10 +87,14 @@ class Registrar(RegistrationListener):  # type: ignore[misc]  # rospy has no typ
         self._thread.start()
 
     def close(self) -> None:
-        """End the thread. What is registered stays so: rospy unregisters it all in one call when it shuts down."""
+        """End the thread; blocks until it has ended, or the master takes longer than `CLOSE_TIMEOUT_S`.
+
+        What is registered stays so: rospy unregisters it all in one call when it shuts down.
+        """
         with self._changed:
             self._closed = True
             self._changed.notify()
+        self._thread.join(CLOSE_TIMEOUT_S)
 
     def settled(self, kind: str, name: str) -> Future[List[str]]:
         """Done once the master has been told of this registration; then the uris of the nodes at the other end.
@@ -161,8 +166,12 @@ class Registrar(RegistrationListener):  # type: ignore[misc]  # rospy has no typ
             logger.warning("the master at %s has forgotten this node; registering everything again", self._master.uri)
             self._known.clear()
         for entry in [each for each in self._known if each not in wanted]:
+            if self._closed:
+                return
             self._unregister(entry, self._known[entry])
         for entry, type_or_uri in wanted.items():
+            if self._closed:
+                return  # rospy is about to unregister everything: nothing may be registered behind its back
             if entry in stale or self._known.get(entry) != type_or_uri:
                 self._register(entry, type_or_uri)
 
