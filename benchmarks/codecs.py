@@ -4,9 +4,10 @@
 
     benchmarks/codecs.py [--quick] [--json FILE] [NAME…]
 
-For each message: microseconds per conversion, and in brackets how many times faster that is than the straightforward
-way of doing the same thing. NAMEs choose messages ("Path"). With --quick each conversion runs just a few times: that shows that it works,
-not how fast it is. Nothing but the packages of the messages is needed: no ROS master, no server.
+For each message: microseconds of CPU time per conversion, and in brackets how many times faster that is than the
+straightforward way of doing the same thing. NAMEs choose messages ("Path"). With --quick each conversion runs just a
+few times: that shows that it works, not how fast it is. Nothing but the packages of the messages is needed: no ROS
+master, no server.
 """
 
 from __future__ import annotations
@@ -23,12 +24,13 @@ import cbor2
 import numpy as np
 from geometry_msgs.msg import Point, PoseStamped, TransformStamped, Twist, TwistStamped
 from nav_msgs.msg import OccupancyGrid, Odometry, Path
-from rosbridge_library.codec import decode_json, get_message_type
-from rosbridge_library.internal.ros_loader import get_message_class
 from sensor_msgs.msg import Image, JointState, LaserScan, PointCloud2, PointField
 from std_msgs.msg import ColorRGBA, String
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import Marker, MarkerArray
+
+from rosbridge_library.codec import decode_json, get_message_type
+from rosbridge_library.internal.ros_loader import get_message_class
 
 COLUMNS = ("to_json", "to_cbor", "to_values", "from_json")
 
@@ -164,7 +166,7 @@ def compiled(name: str) -> Dict[str, Callable[[Any], Any]]:
 
 
 def best_us(function: Callable[[Any], Any], argument: Any, seconds: float) -> float:
-    """Microseconds of CPU time per call: the best of several rounds, so that other load on the machine counts little."""
+    """Microseconds of CPU time per call: the best of several rounds, so that other load counts little."""
     function(argument)
     begin = time.process_time()
     function(argument)

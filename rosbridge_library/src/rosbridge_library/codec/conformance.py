@@ -280,6 +280,7 @@ def _cast_numbers(values: Any, path: str, code: str) -> bytes:
             fits &= ~(np.isfinite(values) & (np.abs(values) >= MAX_FLOAT32))
     elif kind in "iuf":
         low, high = INTEGER_RANGES[code]
+        values = values.astype(np.float64) if kind == "f" else values
         # Compared as floats, 2**63 and 2**64 are exact, one less is not.
         fits = (values >= low) & (values < float(high + 1) if kind == "f" else values <= high)
         if kind == "f":

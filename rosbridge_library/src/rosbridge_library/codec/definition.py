@@ -60,6 +60,7 @@ INTEGER_RANGES: Mapping[str, Tuple[int, int]] = {
 # Bounds on hostile definitions: a few lines of text can nest to billions of fields. Real types stay far below.
 MAX_LEAVES = 20_000
 MAX_FIXED_BYTES = 2**26
+MAX_FIXED_VALUES = 2**20
 MAX_NESTING = 16
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*\Z")
@@ -147,7 +148,8 @@ class Plan:
     md5sum: str
     size: Optional[int]
     min_size: int
-    leaves: int
+    leaves: int  # fields of nested messages included, arrays counted once
+    values: int  # in a message whose arrays of variable length are empty
     nesting: int
 
     @property
@@ -304,12 +306,19 @@ def _make_plan(name: str, fields: Sequence[Field], constants: Sequence[Constant]
     leaves = sum(1 if field.message is None else field.message.leaves for field in fields)
     nesting = 1 + max((field.message.nesting for field in fields if field.message is not None), default=0)
     min_size = sum(field.min_size for field in fields)
-    longest = max((field.length or 0 for field in fields), default=0)
-    if leaves > MAX_LEAVES or nesting > MAX_NESTING or max(min_size, longest) > MAX_FIXED_BYTES:
+    values = sum(_values(field) for field in fields)
+    if leaves > MAX_LEAVES or nesting > MAX_NESTING or min_size > MAX_FIXED_BYTES or values > MAX_FIXED_VALUES:
         raise DefinitionError(f"Message type {name} is too big")
     text = md5_text(fields, constants)
     md5sum = hashlib.md5(text.encode("utf-8", "surrogateescape")).hexdigest()
-    return Plan(name, tuple(fields), tuple(constants), text, md5sum, size, min_size, leaves, nesting)
+    return Plan(name, tuple(fields), tuple(constants), text, md5sum, size, min_size, leaves, values, nesting)
+
+
+def _values(field: Field) -> int:
+    if field.is_binary or (field.is_array and field.length is None):
+        return 1
+    each = 1 if field.message is None else 1 + field.message.values
+    return each if field.length is None else 1 + field.length * each
 
 
 def md5_text(fields: Sequence[Field], constants: Sequence[Constant]) -> str:

@@ -33,8 +33,11 @@ def decode_json(data: Union[bytes, bytearray, memoryview, str]) -> Any:
         if not _may_have_bare_tokens(data):
             raise DecodeError(f"Not JSON: {error}") from error
     try:
-        text = data if isinstance(data, str) else str(data, "utf-8")
-        return json.loads(text, parse_int=_parse_int)
+        text = (data.encode() if isinstance(data, str) else bytes(data)).decode()  # checks surrogates and UTF-8
+        value = json.loads(text, parse_int=_parse_int)
+        if "\\ud" in text.lower():
+            json.dumps(value, ensure_ascii=False).encode()  # fails for half a surrogate pair, as orjson does
+        return value
     except (ValueError, RecursionError) as error:
         raise DecodeError(f"Not JSON: {error}") from error
 

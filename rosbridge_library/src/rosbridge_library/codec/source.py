@@ -65,7 +65,7 @@ class Source:
         text = self.text
         namespace = dict(self._namespace)
         exec(compile(text, filename, "exec"), namespace)
-        made: Callable[..., Any] = namespace[function]
+        made: Callable[..., Any] = namespace.pop(function)  # so that nothing but its users keeps it
         linecache.cache[filename] = (len(text), None, text.splitlines(True), filename)
         weakref.finalize(made, linecache.cache.pop, filename, None)
         return made

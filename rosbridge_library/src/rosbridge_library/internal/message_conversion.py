@@ -11,6 +11,7 @@ import io
 import time
 from typing import Any, Dict, Mapping, Tuple
 
+from ..codec.definition import Plan, is_header_plan
 from ..codec.message_type import MessageType, message_type_from_definition
 from .exceptions import (
     FieldTypeMismatchException,
@@ -39,14 +40,29 @@ def extract_values(inst: Any) -> Dict[str, Any]:
 
 
 def populate_instance(msg: Mapping[str, Any], inst: Any) -> Any:
-    """Fill a message instance from a dictionary, and return it; fields left out get their defaults.
+    """Set the fields of a message instance that a dictionary has, and return the instance.
 
+    Fields that are not in the dictionary stay as they are, but the stamp of a header that is becomes the current time.
     Raises FieldTypeMismatchException, NonexistentFieldException, or InvalidMessageException when `inst` is not a
     message.
     """
     message_type = _message_type(inst)
-    wire, _ = message_type.from_values(msg, _ros_now)
+    values = _merged(message_type.plan, extract_values(inst), msg)
+    wire, _ = message_type.from_values(values, _ros_now)
     return inst.deserialize(wire)
+
+
+def _merged(plan: Plan, current: Dict[str, Any], given: Any) -> Any:
+    """The current values of a message, with those given in their place."""
+    if not isinstance(given, Mapping):
+        return given  # from_values says what is wrong with it
+    merged: Dict[str, Any] = {**current, **given}
+    if is_header_plan(plan) and "stamp" not in given:
+        del merged["stamp"]
+    for field in plan.fields:
+        if field.name in given and field.message is not None and not field.is_array:
+            merged[field.name] = _merged(field.message, current[field.name], given[field.name])
+    return merged
 
 
 def _message_type(inst: Any) -> MessageType:

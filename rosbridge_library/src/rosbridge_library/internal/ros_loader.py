@@ -8,7 +8,9 @@ distributions ship the two apart. The names `package/msg/Type` and `package/srv/
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import sys
+from importlib.machinery import PathFinder
 from types import ModuleType
 from typing import Any, Dict, Tuple
 
@@ -103,16 +105,24 @@ def _get_class(typestring: str, kind: str) -> Any:
 
 
 def _load_module(package: str, kind: str) -> ModuleType:
-    """The module `package.kind`; packages installed since the last look are found."""
+    """The module `package.kind`; packages installed since the last look are found.
+
+    Type names come from clients, so nothing is imported before it is known to be a package of messages: to import a
+    package is to run its code.
+    """
     name = f"{package}.{kind}"
     if name in sys.modules:
         return sys.modules[name]
     importlib.invalidate_caches()
     try:
-        importlib.import_module(package)
-    except Exception as error:  # whatever a package's own code raises
+        spec = importlib.util.find_spec(package)
+    except ValueError as error:  # a module that was not imported in the usual way, such as __main__
         raise InvalidPackageException(package, error) from error
+    if spec is None:
+        raise InvalidPackageException(package)
+    if PathFinder.find_spec(name, spec.submodule_search_locations or []) is None:
+        raise InvalidModuleException(package, kind)
     try:
         return importlib.import_module(name)
-    except Exception as error:
+    except Exception as error:  # whatever the package's own code raises
         raise InvalidModuleException(package, kind, error) from error
