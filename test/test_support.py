@@ -8,6 +8,7 @@ import sys
 
 import pytest
 
+from support.bridge import errors_in
 from support.client import decode, defragment
 from support.node import echo, publish, script, serve
 from support.process import Process
@@ -86,6 +87,23 @@ def test_fragments_are_joined_in_order_and_nan_is_refused():
     assert defragment(fragments) == {"op": "x"}
     with pytest.raises(AssertionError, match="NaN"):
         decode('{"value": NaN}')
+
+
+def test_errors_and_tracebacks_in_a_log_are_found_whole():
+    log = (
+        "[INFO] [1.0]: fine, no ERROR here\n"
+        "[WARN] [2.0]: it broke\n"
+        "Traceback (most recent call last):\n"
+        '  File "x.py", line 1, in y\n'
+        "ValueError: a\n"
+        "[INFO] [3.0]: fine\n"
+        "[ERROR] [4.0]: b\n"
+    )
+    first, second = errors_in(log)
+    assert first.startswith("[WARN] [2.0]: it broke\nTraceback")
+    assert first.endswith("ValueError: a")
+    assert second == "[ERROR] [4.0]: b"
+    assert errors_in(log, ["ValueError"]) == [second]
 
 
 def _runs(pid: int) -> bool:

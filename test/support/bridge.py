@@ -94,7 +94,7 @@ class Bridge:
     def unexpected(self, allowed: Iterable[str] = ()) -> List[str]:
         """Error lines and tracebacks in the logs since the last time this was asked, but for those in which
         one of the patterns `allowed` is found (in the line, or in any line of its traceback)."""
-        patterns = [re.compile(pattern) for pattern in allowed]
+        patterns = list(allowed)
         found: List[str] = []
         for process, offset in self._logs.items():
             with process.log_path.open("rb") as log:
@@ -102,9 +102,7 @@ class Bridge:
                 text = log.read()
             whole = text[: text.rfind(b"\n") + 1] if process.alive else text
             self._logs[process] = offset + len(whole)
-            for entry in _entries(whole.decode("utf-8", "replace")):
-                if _UNEXPECTED.search(entry) and not any(pattern.search(entry) for pattern in patterns):
-                    found.append(f"{process.name}: {entry}")
+            found += [f"{process.name}: {entry}" for entry in errors_in(whole.decode("utf-8", "replace"), patterns)]
         return found
 
     def _start(self, port: int) -> None:
@@ -146,6 +144,15 @@ class Bridge:
 
     def _actual_port(self) -> int:
         return int(self.master.get_param(f"/{self.name}/actual_port", 0))
+
+
+def errors_in(log: str, allowed: Sequence[str] = ()) -> List[str]:
+    """The entries of a log that are errors or have tracebacks, but for those in which an allowed pattern is found."""
+    return [
+        entry
+        for entry in _entries(log)
+        if _UNEXPECTED.search(entry) and not any(re.search(pattern, entry) for pattern in allowed)
+    ]
 
 
 def _entries(text: str) -> List[str]:
