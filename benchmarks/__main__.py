@@ -10,6 +10,7 @@ import fnmatch
 import json
 import os
 import resource
+import signal
 import subprocess
 import sys
 import tempfile
@@ -29,30 +30,37 @@ CODECS = "codecs"
 
 def main(arguments: Optional[Sequence[str]] = None) -> int:
     """Runs it; the exit code is 1 when a case failed."""
-    options = _parser().parse_args(arguments)
-    if options.compare:
-        print(report.compare(*options.compare))
-        return 0
+    parser = _parser()
+    options = parser.parse_args(arguments)
     cases = matching(quick_cases() if options.quick else all_cases(), options.only)
     with_codecs = not options.only or any(fnmatch.fnmatch(CODECS, pattern) for pattern in options.only)
     if options.list:
         print("\n".join([*(case.name for case in cases), *([CODECS] if with_codecs else [])]))
         return 0
-    results = _measure(options, cases) if cases else []
+    try:
+        if options.compare:
+            print(report.compare(*options.compare))
+            return 0
+        candidates = _candidates(options)
+    except (ValueError, OSError) as error:
+        parser.error(str(error))
+    if not cases and not with_codecs:
+        parser.error(f"no case is called {' or '.join(options.only)}; --list names them")
+    signal.signal(signal.SIGTERM, _end)
+    results = _measure(options, cases, candidates) if cases else []
     if with_codecs:
         results += _measure_codecs(options.quick)
     if options.json:
-        date = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
-        document = {"date": date, "quick": options.quick, "machine": machine(), "results": results}
-        report.save(options.json, document)
+        _save(options, results)
     print(report.table(results))
     if len(report.servers_of(results)) > 1:
         print("\n" + report.ratios(results))
     return 1 if any("error" in result for result in results) else 0
 
 
-def _measure(options: argparse.Namespace, cases: Sequence[Case]) -> List[Dict[str, Any]]:
-    candidates = _candidates(options)
+def _measure(
+    options: argparse.Namespace, cases: Sequence[Case], candidates: Sequence[Candidate]
+) -> List[Dict[str, Any]]:
     durations = QUICK if options.quick else Durations(window_s=options.seconds)
     _allow_many_connections()
     results: List[Dict[str, Any]] = []
@@ -65,7 +73,19 @@ def _measure(options: argparse.Namespace, cases: Sequence[Case]) -> List[Dict[st
             results.append(result)
             outcome = "failed" if "error" in result else "skipped" if "skipped" in result else "measured"
             print(f"{result['case']} {result['server']}: {outcome}", file=sys.stderr, flush=True)
+            if options.json:
+                _save(options, results)  # a run that is broken off has not been for nothing
     return results
+
+
+def _save(options: argparse.Namespace, results: Sequence[Dict[str, Any]]) -> None:
+    date = datetime.datetime.now(datetime.timezone.utc).isoformat(timespec="seconds")
+    report.save(options.json, {"date": date, "quick": options.quick, "machine": machine(), "results": results})
+
+
+def _end(_number: int, _frame: object) -> None:
+    """SIGTERM ends the run as Ctrl-C does: with all that it has started."""
+    raise KeyboardInterrupt
 
 
 def _measure_codecs(quick: bool) -> List[Dict[str, Any]]:
@@ -126,4 +146,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except KeyboardInterrupt:
+        sys.exit("interrupted")

@@ -184,6 +184,7 @@ class Runner:
         result: Result = {"seconds": seconds}
         if server.pids:
             others_s = machine_end - machine_begin - cpu_s - (ours_end.cpu_s - ours_begin.cpu_s)
+            result["cpu_s"] = round(cpu_s, 2)  # /proc counts hundredths
             result["cpu_percent"] = round(100 * cpu_s / seconds, 1)
             result["rss_mb"] = round(server_end.rss_bytes / 1e6, 1)
             result["other_cpu_percent"] = round(max(0.0, 100 * others_s / seconds), 1)
@@ -229,8 +230,8 @@ def _figures(usage_: Result, received: Result) -> Result:
         "latency_median_ms": received["latency_median_ms"],
         "latency_p99_ms": received["latency_p99_ms"],
     }
-    if "cpu_percent" in usage_ and arrived:
-        result["cpu_us_per_message"] = round(usage_["cpu_percent"] / 100 * seconds / arrived * 1e6, 1)
+    if "cpu_s" in usage_ and arrived:
+        result["cpu_us_per_message"] = round(usage_["cpu_s"] / arrived * 1e6, 1)
     return result
 
 
