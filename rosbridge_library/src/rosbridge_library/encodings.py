@@ -13,6 +13,7 @@ import io
 import itertools
 import math
 import struct
+import zlib
 from typing import Any, Callable, Dict, Iterator, List, Mapping, Optional
 
 import cbor2
@@ -155,14 +156,30 @@ def _to_png(text: bytes) -> bytes:
 def from_png(data: str) -> bytes:
     """The text in the pixels of a base64 PNG image. Raises DecodeError."""
     try:
-        width, height, rows, info = png.Reader(bytes=base64.b64decode(data, validate=True)).read()
-        if width * height * info["planes"] > MAX_PNG_BYTES:
-            raise DecodeError(f"a PNG image of {width} x {height} is too large")
-        if info["bitdepth"] != 8 or "palette" in info:
-            raise DecodeError("a PNG image must have 8 bits a channel and no palette")
+        image = base64.b64decode(data, validate=True)
+        _check_png(image)
+        _, _, rows, _ = png.Reader(bytes=image).read()
         return b"".join(map(bytes, rows)).rstrip(b"\n\0")
-    except (ValueError, png.Error) as error:
+    except (ValueError, EOFError, png.Error, zlib.error) as error:
         raise DecodeError(f"not a base64 PNG image: {error}") from error
+
+
+def _check_png(image: bytes) -> None:
+    """Raise for an image that can't hold text, or that would unpack to more than it says, or than is good."""
+    reader = png.Reader(bytes=image)
+    reader.preamble()
+    if getattr(reader, "bitdepth", None) != 8 or reader.colormap:
+        raise DecodeError("a PNG image must have 8 bits a channel and no palette")
+    size = reader.width * reader.height * reader.planes
+    if size > MAX_PNG_BYTES:
+        raise DecodeError(f"a PNG image of {reader.width} x {reader.height} is too large")
+    left = size + 2 * reader.height + 64  # each row of each pass has a byte in front
+    inflater = zlib.decompressobj()
+    for kind, data in png.Reader(bytes=image).chunks():
+        if kind == b"IDAT":
+            left -= len(inflater.decompress(data, left))
+            if left <= 0:
+                raise DecodeError("a PNG image has more pixels than it says")
 
 
 def in_fragments(payload: Payload, fragment_size: Optional[int]) -> List[Payload]:

@@ -15,6 +15,10 @@ from rosbridge_library.internal.exceptions import InvalidArgumentException
 _GLOBAL_NAME = re.compile(r"(?:/[A-Za-z0-9_]+)+\Z")
 
 
+MAX_NAME_LENGTH = 1000
+"""In characters. ROS has no limit, but a name goes to the master and into every list of names."""
+
+
 def global_name(name: str) -> str:
     """`name` as a global name: one leading slash, no double slashes, none at the end."""
     return "/" + "/".join(part for part in name.split("/") if part)
@@ -22,6 +26,8 @@ def global_name(name: str) -> str:
 
 def checked_global_name(name: str, what: str) -> str:
     """`global_name(name)`, or InvalidArgumentException saying why `name` can't name a `what` (topic, service)."""
+    if len(name) > MAX_NAME_LENGTH:
+        raise InvalidArgumentException(f"'{name[:200]}…' is too long a name for a {what}: {len(name)} characters")
     resolved = global_name(name)
     if not _GLOBAL_NAME.match(resolved):
         raise InvalidArgumentException(f"'{name[:200]}' is not a legal name for a {what}")

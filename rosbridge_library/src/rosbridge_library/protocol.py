@@ -55,6 +55,9 @@ _LOGGING_LEVELS = {"error": logging.WARNING, "warning": logging.DEBUG, "info": l
 MAX_WAITING_OPERATIONS = 64
 """How many operations may wait behind one that isn't finished before the connection should stop reading."""
 
+MAX_STATUS_LENGTH = 1000
+"""In characters."""
+
 FINISH_TIMEOUT_S = 2.0
 """How long what a client sent before it left may take to be published."""
 
@@ -269,6 +272,8 @@ class Protocol:
 
     def log(self, level: str, message: str, lid: OperationId = None) -> None:
         """Log `message`, and send it to the client when it asked for `level`; `lid` is the id of what caused it."""
+        if len(message) > MAX_STATUS_LENGTH:
+            message = message[:MAX_STATUS_LENGTH] + "…"  # it quotes what the client sent, which may be megabytes
         about = f" [id: {lid}]" if lid is not None else ""
         logger.log(_LOGGING_LEVELS[level], "[client %s]%s %s", self.client_id, about, message)
         if STATUS_LEVELS[level] <= STATUS_LEVELS[self.status_level]:

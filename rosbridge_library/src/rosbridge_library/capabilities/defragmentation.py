@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 MAX_INCOMPLETE_MESSAGES = 64
 MAX_FRAGMENTS = 1_000_000
+MAX_DEPTH = 3
 FRAGMENT_OVERHEAD_BYTES = 128
 """What keeping a fragment takes beside its text."""
 
@@ -41,6 +42,7 @@ class Defragment(Capability):
         super().__init__(protocol)
         self._incomplete: Dict[Tuple[Unpack, Hashable], _Collection] = {}
         self._bytes = 0
+        self._depth = 0
         protocol.register_operation("fragment", self.defragment)
         protocol.register_operation("png", self.png)
 
@@ -54,8 +56,8 @@ class Defragment(Capability):
     def png(self, message: Operation) -> Optional[Awaitable[None]]:
         """Take an operation as a PNG image, whole or one fragment of it."""
         self.basic_type_check(message, self.png_msg_fields)
-        if message.get("total") is None:
-            return self.protocol.handle(_unpack_png(message["data"]))
+        if message.get("total") in (None, 1):
+            return self._handle(_unpack_png, message["data"])
         if message.get("id") is None or message.get("num") is None:
             raise MissingArgumentException("a fragmented png needs the fields 'id', 'num' and 'total'")
         return self._collect(message, _unpack_png)
@@ -88,7 +90,17 @@ class Defragment(Capability):
             return None
         text = "".join(collection.parts[index] for index in range(total))
         self._give_up(key)
-        return self.protocol.handle(unpack(text))
+        return self._handle(unpack, text)
+
+    def _handle(self, unpack: Unpack, text: str) -> Optional[Awaitable[None]]:
+        """Handle the operation in `text`, which may be packed in turn: a png in fragments, say, but no deeper."""
+        if self._depth == MAX_DEPTH:
+            raise InvalidArgumentException(f"an operation may be packed {MAX_DEPTH} times at most")
+        self._depth += 1
+        try:
+            return self.protocol.handle(unpack(text))
+        finally:
+            self._depth -= 1
 
     def _time_out(self, key: Tuple[Unpack, Hashable]) -> None:
         collection = self._incomplete[key]
