@@ -9,7 +9,13 @@ from typing import Any, Dict
 import numpy as np
 import pytest
 
-from rosbridge_library.codec import WireError, get_message_type, message_type_from_definition
+from rosbridge_library.codec import (
+    WireError,
+    decode_cbor,
+    decode_json,
+    get_message_type,
+    message_type_from_definition,
+)
 
 LINE = "\n" + "=" * 80 + "\n"
 
@@ -123,7 +129,8 @@ def test_binary_data(field: str) -> None:
     ("field", "tag", "size"),
     [
         ("uint16", "d845", 2), ("uint32", "d846", 4), ("uint64", "d847", 8), ("byte", "d848", 1), ("int8", "d848", 1),
-        ("int16", "d84d", 2), ("int32", "d84e", 4), ("int64", "d84f", 8), ("float32", "d855", 4), ("float64", "d856", 8),
+        ("int16", "d84d", 2), ("int32", "d84e", 4), ("int64", "d84f", 8), ("float32", "d855", 4),
+        ("float64", "d856", 8),
     ],
 )  # fmt: skip
 def test_numeric_arrays_are_the_wire_under_their_tag(field: str, tag: str, size: int) -> None:
@@ -209,6 +216,29 @@ def test_long_arrays_of_small_messages_are_like_short_ones() -> None:
     elements = [rng.bytes(1 + 1 + 8 + 2 + 4 + 16 + 8) for _ in range(50)]
     singles = [message_type.to_cbor(b"\1\0\0\0" + element)[len(b"\xa1\x61a\x81") :] for element in elements]
     assert message_type.to_cbor(b"\x32\0\0\0" + b"".join(elements)) == wire("a1 6161 98 32") + b"".join(singles)
+
+
+def test_an_array_like_the_last_one_is_read_the_same() -> None:
+    """Arrays of names are remembered from message to message: whatever comes in between, they must be right."""
+    definition = "string[] names\nPart[] parts\nint8 last" + LINE + "MSG: my_msgs/Part\nstring name\nuint8 kind"
+    message_type = message_type_from_definition("my_msgs/Named", definition)
+    lists = ([], ["a"], ["a", "bc"], ["a", "b"], ["a", "bc", "d"], ["", ""], [], ["x" * 5000], ["a", "bc"])
+    right: Any = [
+        {"names": names, "parts": [{"name": name, "kind": index} for index, name in enumerate(names)], "last": last}
+        for last in (1, 2)
+        for names in lists
+    ]
+    wires = [message_type.from_values(values, lambda: (0, 0))[0] for values in right]
+    # A corrupt one, whose last string ends behind the bytes, must leave nothing behind.
+    cut = wire("02000000 01000000 61 ff000000 6263")
+    for values, raw in zip(right * 2, wires * 2):
+        for _ in range(2):
+            assert decode_json(message_type.to_json(raw)) == values
+            assert decode_cbor(message_type.to_cbor(raw)) == values
+            for broken in (raw[:-1], raw[:-3], cut, b"\xff\xff\xff\xff" + raw[4:]):
+                for convert in (message_type.to_json, message_type.to_cbor):
+                    with pytest.raises(WireError):
+                        convert(broken)
 
 
 def test_views_are_read_like_bytes() -> None:

@@ -20,7 +20,7 @@ import numpy as np
 from .definition import NUMBER_CODES, NUMPY_TYPES, TIME_CODES, Field, Plan
 from .pieces import Pieces
 from .source import Source
-from .wire_walk import WireWalk, number_size, walk_function
+from .wire_walk import WireWalk, is_memorable, number_size, walk_function
 
 # RFC 8746 tags of little-endian typed arrays; arrays of bool and bytes have none.
 ARRAY_TAGS: Mapping[str, int] = {
@@ -200,13 +200,25 @@ class _CborWriter(WireWalk):
                 self.element(field)
         elif width is not None and width <= ROW_NUMBERS:
             self._rows(field, count)
+        elif self.depth or not is_memorable(field):
+            self._loop(field, count)
         else:
             self.flush()
             self.pieces.emit()
-            with self.elements(field, count):
-                self.element(field)
-                self.flush()
-                self.pieces.emit()
+            made = self.source.fresh("l")
+            with self.remembered(count, made, b""):
+                self.source.line("outer, out = out, []")
+                self._loop(field, count)
+                self.source.line(f'{made}, out = b"".join(out), outer')
+            self.pieces.piece(made)
+
+    def _loop(self, field: Field, count: str) -> None:
+        self.flush()
+        self.pieces.emit()
+        with self.elements(field, count):
+            self.element(field)
+            self.flush()
+            self.pieces.emit()
 
     def _rows(self, field: Field, count: str) -> None:
         """An array of elements of a fixed size, none of which is looked at by itself."""

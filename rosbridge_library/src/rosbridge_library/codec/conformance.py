@@ -178,21 +178,36 @@ def boolean(value: Any, path: str, missing: Missing, code: str = "?", suffix: st
     misfit(path, _EXPECTED["?"], value, suffix)
 
 
-def text(value: Any, path: str, missing: Missing) -> str:
+def text(value: Any, path: str, missing: Missing, suffix: str = "") -> str:
     if value is LEFT_OUT:
         left_out(path, missing)
         return ""
     if isinstance(value, str):
         return value
-    misfit(path, "a string", value)
+    misfit(path, "a string", value, suffix)
 
 
-def encoded(value: str, path: str) -> bytes:
+def texts(value: Any, path: str, missing: Missing, field: Field) -> List[bytes]:
+    """The wire bytes of the strings of a list, each with its length."""
+    values = sequence(value, path, missing, field)
+    if not {str}.issuperset(map(type, values)):
+        values = [text(item, path, missing, f"[{index}]") for index, item in enumerate(values)]
+    try:
+        raw = [item.encode() for item in values]
+    except UnicodeEncodeError:
+        raw = [encoded(item, path, f"[{index}]") for index, item in enumerate(values)]
+    return [_LENGTH(len(item)) + item for item in raw]
+
+
+_LENGTH = struct.Struct("<I").pack
+
+
+def encoded(value: str, path: str, suffix: str = "") -> bytes:
     """The UTF-8 of a string; half a surrogate pair has none."""
     try:
         return value.encode()
     except UnicodeEncodeError:
-        misfit(path, "a string of Unicode characters", value)
+        misfit(path, "a string of Unicode characters", value, suffix)
 
 
 # Arrays

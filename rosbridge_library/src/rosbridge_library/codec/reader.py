@@ -8,6 +8,8 @@ message is put between pieces of JSON as base64, uncopied.
 
 from __future__ import annotations
 
+import functools
+import struct
 from typing import Any, Callable, Dict, List, Optional, Tuple
 
 import numpy as np
@@ -17,7 +19,7 @@ import pybase64
 from .definition import NUMBER_CODES, NUMPY_TYPES, TIME_CODES, Field, Plan
 from .pieces import joined_pieces
 from .source import Source
-from .wire_walk import WireWalk, element_code, number_size, walk_function
+from .wire_walk import WireWalk, element_code, is_memorable, number_size, walk_function
 
 # Fixed-length arrays of up to so many numbers are read into Python numbers with the run that they stand in; for
 # longer ones a NumPy view is cheaper.
@@ -78,14 +80,22 @@ class _Reader(WireWalk):
             return self.from_view(f"frombuffer(wire, {dtype}, {field.length}, {where})", code)
         name = self.source.fresh("a")
         count = self.count()
-        view = f"frombuffer(wire, {dtype}, {count}, {self.position})"
+        start = self.position
+        view = f"frombuffer(wire, {dtype}, {count}, {start})"
         size = number_size(code)
         self.take(count if size == 1 else f"{count} * {size}")
-        self.source.line(f"{name} = {self.from_view(view, code)}")
+        few = self.source.constant("FEW", code, _few_unpackers(code))
+        self.source.line(f"if {count} < {INLINE_NUMBERS}:")
+        self.source.line(f"    {name} = {self.from_tuple(f'{few}[{count}](wire, {start})')}")
+        self.source.line("else:")
+        self.source.line(f"    {name} = {self.from_view(view, code)}")
         return name
 
     def items(self, field: Field) -> str:
-        count = str(field.length) if field.length is not None else self.count()
+        """An array of messages, strings or times."""
+        return self._items(field, str(field.length) if field.length is not None else self.count())
+
+    def _items(self, field: Field, count: str) -> str:
         name = self.source.fresh("l")
         width = self._element_width(field)
         if field.element_size == 0:
@@ -110,6 +120,9 @@ class _Reader(WireWalk):
         raise NotImplementedError
 
     def from_view(self, view: str, code: str) -> str:
+        raise NotImplementedError
+
+    def from_tuple(self, numbers: str) -> str:
         raise NotImplementedError
 
     def _width(self, field: Field) -> Optional[int]:
@@ -142,10 +155,25 @@ class _ValuesReader(_Reader):
     def from_view(self, view: str, code: str) -> str:
         return f"({view} != 0).tolist()" if code == "?" else f"{view}.tolist()"
 
+    def from_tuple(self, numbers: str) -> str:
+        return f"list({numbers})"
+
 
 class _JsonReader(_Reader):
+    def items(self, field: Field) -> str:
+        if self.depth or not is_memorable(field):
+            return super().items(field)
+        count = self.count()
+        made = self.source.fresh("l")
+        with self.remembered(count, made, orjson.Fragment(b"[]")):
+            self.source.line(f"{made} = Fragment(dumps({self._items(field, count)}, None, NUMPY))")
+        return made
+
     def from_bytes(self, raw: str) -> str:
         return f"base64_text({raw})"
+
+    def from_tuple(self, numbers: str) -> str:
+        return numbers
 
     def from_view(self, view: str, code: str) -> str:
         if code == "?":
@@ -155,6 +183,12 @@ class _JsonReader(_Reader):
             return f"widened({view})"
         # orjson reads the memory as it is: a copy makes it aligned.
         return view if number_size(code) == 1 else f"{view}.copy()"
+
+
+@functools.lru_cache(maxsize=None)
+def _few_unpackers(code: str) -> List[Callable[..., Tuple[Any, ...]]]:
+    """Functions that unpack so many numbers of a struct code as their index says."""
+    return [struct.Struct(f"<{count}{code}").unpack_from for count in range(INLINE_NUMBERS)]
 
 
 @np.errstate(invalid="ignore")
@@ -191,7 +225,9 @@ def compile_json_pieces(plan: Plan) -> Callable[[Any], Tuple[bytes, ...]]:
 def _compile_json(plan: Plan, joined: bool) -> Callable[[Any], Any]:
     source = Source(f"{plan.name} to_json")
     source.use(frombuffer=np.frombuffer, widened=_widened, base64_text=pybase64.b64encode_as_string)
-    source.use(base64=pybase64.b64encode, dumps=orjson.dumps, NUMPY=orjson.OPT_SERIALIZE_NUMPY)
+    source.use(
+        base64=pybase64.b64encode, dumps=orjson.dumps, Fragment=orjson.Fragment, NUMPY=orjson.OPT_SERIALIZE_NUMPY
+    )
     with walk_function(source, plan):
         reader = _JsonReader(source)
         pieces = _json_pieces(reader, plan)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import struct
 from contextlib import contextmanager
-from typing import Iterator, List, Tuple
+from typing import Any, Iterator, List, Tuple, Union
 
 from ..internal.exceptions import WireError
 from .definition import CODE_SIZES, NUMBER_CODES, TIME_CODES, Field, Plan
@@ -22,6 +22,40 @@ from .source import Source
 
 # Elements that take no bytes on the wire: no length of the wire bounds how many there may be.
 MAX_EMPTY_ELEMENTS = 4096
+
+
+# Remembered arrays are at most so long on the wire.
+MAX_REMEMBERED_BYTES = 4096
+
+
+class Memory:
+    """What an array of a message was on the wire the last time, and what was made of it.
+
+    Arrays of names and of layouts (the joints of a robot, the fields of a point cloud) are the same in message after
+    message. An entry is replaced as a whole, so that threads need no lock.
+    """
+
+    def __init__(self, made: Any) -> None:
+        self.entry: Tuple[int, bytes, Any] = (0, b"", made)  # number of elements, their wire bytes
+
+    def keep(self, count: int, raw: Union[bytes, memoryview], made: Any) -> None:
+        if len(raw) <= MAX_REMEMBERED_BYTES:
+            self.entry = (count, bytes(raw), made)
+
+
+def is_memorable(field: Field) -> bool:
+    """Whether a field is an array of variable length, whose elements have strings but nothing that is measured."""
+    return field.is_array and field.length is None and _has_strings(field) and not _is_measured(field)
+
+
+def _has_strings(field: Field) -> bool:
+    return field.type == "string" or (field.message is not None and any(map(_has_strings, field.message.fields)))
+
+
+def _is_measured(field: Field) -> bool:
+    if field.message is not None:
+        return any(map(_is_measured, field.message.fields))
+    return field.type in TIME_CODES or field.type in ("float32", "float64")
 
 
 def corrupt(name: str, wire: bytes, reason: object) -> WireError:
@@ -131,6 +165,26 @@ class WireWalk:
         self.flush()
         with self.source.block(f"if {self.position} != end:"):
             self.source.line(f'raise ValueError("its fields take %d" % ({self.position}))')
+
+    @contextmanager
+    def remembered(self, count: str, made: str, empty: Any) -> Iterator[None]:
+        """An array that is made anew, by what is generated inside, only when it is not the one of the last message.
+
+        `made` is the variable that has what is made of it, `empty` what is made of no elements.
+        """
+        memory = self.source.fresh("memory")
+        self.source.use(**{memory: Memory(empty)})
+        known, raw, after = self.source.fresh("n"), self.source.fresh("raw"), self.source.fresh("o")
+        start = self.position
+        self.source.line(f"{known}, {raw}, {made} = {memory}.entry")
+        self.source.line(f"{after} = {start} + len({raw})")
+        with self.source.block(f"if {count} != {known} or wire[{start}:{after}] != {raw}:"):
+            yield
+            self.flush()
+            self.source.line(f"{after} = {self.position}")
+            with self.source.block(f"if {after} <= end:"):
+                self.source.line(f"{memory}.keep({count}, wire[{start}:{after}], {made})")
+        self._base, self._run_start, self._offset = after, 0, 0
 
     def check_count(self, field: Field, count: str) -> None:
         """Make sure, before a loop, that so many elements can be there."""

@@ -97,6 +97,13 @@ class _WireWriter:
 
     def array(self, field: Field, value: str, path: str) -> None:
         spec = self.source.constant("FIELD", field, field)
+        if field.type == "string":
+            texts = self.source.fresh("a")
+            self.source.line(f"{texts} = texts({value}, {path!r}, missing, {spec})")
+            if field.length is None:
+                self.pieces.pack("I", f"len({texts})")
+            self.pieces.piece(f'b"".join({texts})')
+            return
         if field.type not in NUMBER_CODES:
             self.elements(field, value, path, spec)
             return
@@ -109,7 +116,7 @@ class _WireWriter:
         self.pieces.piece(raw)
 
     def elements(self, field: Field, value: str, path: str, spec: str) -> None:
-        """An array of messages, strings or times: a loop."""
+        """An array of messages or times: a loop."""
         unusual = f"type({value}) is not list"
         if field.length is not None:
             unusual += f" or len({value}) != {field.length}"
@@ -136,7 +143,7 @@ def _loop_depth(plan: Plan) -> int:
     depths = [0]
     for field in plan.fields:
         inner = _loop_depth(field.message) if field.message is not None else 0
-        depths.append(inner + (field.is_array and field.type not in NUMBER_CODES))
+        depths.append(inner + (field.is_array and field.type not in NUMBER_CODES and field.type != "string"))
     return max(depths)
 
 
@@ -146,9 +153,8 @@ def compile_wire_writer(plan: Plan) -> Callable[[Mapping[str, Any], Now], Tuple[
     It raises FieldTypeMismatchException and NonexistentFieldException.
     """
     body = Source(f"{plan.name} from_values")
-    names = (
-        "unknown partial mapping header time stamp duration real integer boolean text encoded sequence binary numbers"
-    )
+    names = "unknown partial mapping header time stamp duration real integer boolean text encoded"
+    names += " sequence texts binary numbers"
     body.use(**{name: getattr(conformance, name) for name in names.split()})
     body.use(LEFT_OUT=conformance.LEFT_OUT, Misfit=Misfit, NAME=plan.name, PLAN=plan)
     writer = _WireWriter(body)
