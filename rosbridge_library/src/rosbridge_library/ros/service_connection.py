@@ -12,7 +12,7 @@ import asyncio
 import socket
 import threading
 from concurrent.futures import Future
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, Callable, Dict, Iterator, List, Mapping, Tuple
 
 import rosgraph.network
@@ -195,6 +195,8 @@ async def _addresses(host: str) -> List[Tuple[int, str]]:
     A name server that does not answer blocks its thread for long: so there is one per host, joined by all
     who ask meanwhile, and a daemon, since the threads of an executor would hold up the end of the process.
     """
+    with suppress(socket.gaierror, UnicodeError):
+        return _look_up(host, socket.AI_NUMERICHOST)  # an address needs no name server
     with _resolving_lock:
         future = _resolving.get(host)
         if future is None:
@@ -204,14 +206,17 @@ async def _addresses(host: str) -> List[Tuple[int, str]]:
     return await asyncio.wrap_future(future)
 
 
-def _resolve(host: str, future: Future[List[Tuple[int, str]]]) -> None:
+def _look_up(host: str, flags: int = 0) -> List[Tuple[int, str]]:
     family = socket.AF_UNSPEC if rosgraph.network.use_ipv6() else socket.AF_INET
+    found = socket.getaddrinfo(host, None, family, socket.SOCK_STREAM, 0, flags)
+    return [(entry[0], str(entry[4][0])) for entry in found]
+
+
+def _resolve(host: str, future: Future[List[Tuple[int, str]]]) -> None:
     try:
-        found = socket.getaddrinfo(host, None, family, socket.SOCK_STREAM)
+        outcome: Any = _look_up(host)
     except (OSError, UnicodeError) as error:
-        outcome: Any = error
-    else:
-        outcome = [(entry[0], str(entry[4][0])) for entry in found]
+        outcome = error
     with _resolving_lock:
         del _resolving[host]
     if isinstance(outcome, Exception):
