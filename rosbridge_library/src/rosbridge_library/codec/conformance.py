@@ -190,7 +190,7 @@ def text(value: Any, path: str, missing: Missing, suffix: str = "") -> str:
 def texts(value: Any, path: str, missing: Missing, field: Field) -> List[bytes]:
     """The wire bytes of the strings of a list, each with its length."""
     values = sequence(value, path, missing, field)
-    if not {str}.issuperset(map(type, values)):
+    if not set(map(type, values)) <= {str}:
         values = [text(item, path, missing, f"[{index}]") for index, item in enumerate(values)]
     try:
         raw = [item.encode() for item in values]
@@ -272,7 +272,7 @@ _INTEGER = frozenset({int})
 
 
 def _pack_numbers(values: Sequence[Any], path: str, code: str) -> bytes:
-    if _PLAIN_TYPES.get(code, _INTEGER).issuperset(map(type, values)):
+    if set(map(type, values)) <= _PLAIN_TYPES.get(code, _INTEGER):
         try:
             return struct.pack(f"<{len(values)}{code}", *values)
         except (struct.error, OverflowError):
