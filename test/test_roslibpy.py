@@ -7,6 +7,7 @@ expect one fails of it. Its Twisted reactor can run only once in a process, so i
 
 from __future__ import annotations
 
+import itertools
 import json
 import logging
 import math
@@ -188,7 +189,7 @@ def test_throttle_rate_keeps_messages_apart(ros: roslibpy.Ros):
     ros.on("/robot/count", lambda _: times.append(time.monotonic()))
     received = numbers(collect(roslibpy.Topic(ros, *COUNT, throttle_rate=150), 6))
     assert times[5] - times[0] > 0.8 * 5 * 0.150
-    assert received[-1] - received[0] >= 40
+    assert received[-1] - received[0] >= 30
 
 
 def test_queue_length_keeps_what_the_throttle_holds_back(ros: roslibpy.Ros, ros_master: RosMaster, nodes):
@@ -299,21 +300,21 @@ def call(ros: roslibpy.Ros, name: str, **values: Any) -> Any:
     return dict(roslibpy.Service(ros, name, ADD).call(roslibpy.ServiceRequest(values), timeout=10))
 
 
-def ask_robot(ros: roslibpy.Ros, service: str, a: int, b: int) -> Any:
-    """Has the robot, a ROS node, call a service; its answer."""
-    request = json.dumps({"service": service, "a": a, "b": b})
-    answers: List[Any] = []
-    done = roslibpy.Topic(ros, "/robot/called", "std_msgs/String")
-    done.subscribe(lambda message: answers.append(json.loads(message["data"])))
-    ask = roslibpy.Topic(ros, "/robot/call", "std_msgs/String")
-    ask.publish(roslibpy.Message({"data": request}))
-    found = wait_until(
-        lambda: [answer for answer in answers if answer["asked"] == request], 10.0, f"answer to {request}"
-    )
-    done.unsubscribe()
+asked = itertools.count()
+
+
+def ask_robot(ros: roslibpy.Ros, topic: str, **request: Any) -> Any:
+    """Has the robot, a ROS node, do something; its answer."""
+    answer_to = f"/roslibpy/answer{next(asked)}"
+    ask = roslibpy.Topic(ros, topic, "std_msgs/String")
+    ask.publish(roslibpy.Message({"data": json.dumps({**request, "answer_to": answer_to})}))
+    (answer,) = collect(roslibpy.Topic(ros, answer_to, "std_msgs/String"), 1, timeout=20.0)
     ask.unadvertise()
-    del found[0]["asked"]
-    return found[0]
+    return json.loads(answer["data"])
+
+
+def have_called(ros: roslibpy.Ros, service: str, a: int, b: int) -> Any:
+    return ask_robot(ros, "/robot/call", service=service, a=a, b=b)
 
 
 def test_services_answer_blocking_and_not(ros: roslibpy.Ros):
@@ -352,8 +353,8 @@ def test_a_program_provides_a_service(open_ros: Open, ros_master: RosMaster):
     name = "/roslibpy/sum"
     service = roslibpy.Service(ros, name, ADD)
     service.advertise(add)
-    assert ask_robot(ros, name, 20, 22) == {"sum": 42}
-    assert ask_robot(ros, name, -5, 1) == {"sum": -4}  # values count, although the result is false
+    assert have_called(ros, name, 20, 22) == {"sum": 42}
+    assert have_called(ros, name, -5, 1) == {"sum": -4}  # values count, although the result is false
     assert call(other, name, a=1, b=2) == {"sum": 3}
     assert other.get_service_type(name) == ADD
     service.unadvertise()
@@ -361,7 +362,7 @@ def test_a_program_provides_a_service(open_ros: Open, ros_master: RosMaster):
     with pytest.raises(Exception, match=name):
         call(other, name, a=1, b=2)
     service.advertise(add)
-    assert ask_robot(ros, name, 1, 1) == {"sum": 2}
+    assert have_called(ros, name, 1, 1) == {"sum": 2}
 
 
 def test_a_service_whose_callback_returns_nothing_answers(ros: roslibpy.Ros):
@@ -369,7 +370,7 @@ def test_a_service_whose_callback_returns_nothing_answers(ros: roslibpy.Ros):
         response["sum"] = request["a"]
 
     roslibpy.Service(ros, "/roslibpy/careless", ADD).advertise(answer)
-    assert ask_robot(ros, "/roslibpy/careless", 7, 0) == {"sum": 7}
+    assert have_called(ros, "/roslibpy/careless", 7, 0) == {"sum": 7}
 
 
 def test_parameters(ros: roslibpy.Ros, ros_master: RosMaster):
@@ -449,7 +450,8 @@ def test_goals_are_carried_out(action_client):
     for goal in (5, 2):
         done = send(client, goal)
         assert done.wait(10) == {"result": goal}
-        assert done.seen == list(range(1, goal + 1))
+        wait_until(lambda done=done, goal=goal: done.seen and done.seen[-1] == goal, 5.0, "all feedback")
+        assert is_run(done.seen)
         wait_until(lambda done=done: done.status["status"] == actionlib.GoalStatus.SUCCEEDED, 5.0, "success")
 
 
@@ -480,8 +482,8 @@ def test_two_goals_at_once(action_client):
     cancelled.cancel()
     assert cancelled.wait(10)["result"] == cancelled.seen[-1] < 1000
     assert done.wait(10) == {"result": 10}
+    wait_until(lambda: done.seen[-1] == 10, 5.0, "all feedback")
     assert is_run(done.seen)
-    assert done.seen[-1] == 10
 
 
 def test_an_action_client_tells_that_there_is_no_server(action_client, monkeypatch):
@@ -491,10 +493,6 @@ def test_an_action_client_tells_that_there_is_no_server(action_client, monkeypat
 
 
 def test_an_action_server_in_the_program(ros: roslibpy.Ros):
-    outcomes: List[Any] = []
-    roslibpy.Topic(ros, "/robot/goal_done", "std_msgs/String").subscribe(
-        lambda message: outcomes.append(json.loads(message["data"]))
-    )
     noted: List[int] = []
     roslibpy.Topic(ros, "/robot/goal_feedback", "std_msgs/Int32").subscribe(
         lambda message: noted.append(message["data"])
@@ -513,9 +511,7 @@ def test_an_action_server_in_the_program(ros: roslibpy.Ros):
         server.set_succeeded({"result": number * 2})
 
     server.start(act)
-    ask = roslibpy.Topic(ros, "/robot/send_goals", "std_msgs/String")
-    ask.publish(roslibpy.Message({"data": json.dumps({"server": "/roslibpy/action", "goals": [3, 4, 5]})}))
-    wait_until(lambda: len(outcomes) == 3, 15.0, lambda: f"three outcomes, not {outcomes}")
+    outcomes = ask_robot(ros, "/robot/send_goals", server="/roslibpy/action", goals=[3, 4, 5])
     first, second, cancelled = outcomes
     succeeded = {"finished": True, "state": actionlib.GoalStatus.SUCCEEDED}
     assert first == {**succeeded, "result": 6, "feedback": [30]}

@@ -56,14 +56,12 @@ export async function goalTimeout(page, { server }) {
   return { before, outcome: await goal.outcome };
 }
 
-// The client's timeout comes when there is no server, and doesn't when there is one.
+// The client's timeout comes when there is no server, and doesn't when there is one, whose time is over first.
 export async function serverTimeout(page, { server, nobody }) {
   const ros = await page.connect();
   const timedOut = [];
-  client(page, ros, server, { timeout: 500 }).on('timeout', () => timedOut.push(server));
-  const lonely = client(page, ros, nobody, { timeout: 500 });
-  await once(lonely, 'timeout');
-  await send(page, client(page, ros, server), 1).outcome;
+  client(page, ros, server, { timeout: 1000 }).on('timeout', () => timedOut.push(server));
+  await once(client(page, ros, nobody, { timeout: 1000 }), 'timeout');
   return timedOut;
 }
 
@@ -108,9 +106,9 @@ export async function serve(page, { server }) {
     if (data === 40) actionServer.setAborted({ result: 0 });
   });
   actionServer.on('cancel', () => actionServer.setPreempted());
-  const done = new page.roslib.Topic({ ros, name: '/robot/goal_done', messageType: 'std_msgs/String' });
-  const outcomes = collect(done, 3);
+  const answerTo = `${server}/outcomes`;
   const ask = new page.roslib.Topic({ ros, name: '/robot/send_goals', messageType: 'std_msgs/String' });
-  ask.publish(page.message({ data: JSON.stringify({ server, goals: [3, 4, 5] }) }));
-  return (await outcomes).map((message) => JSON.parse(message.data));
+  ask.publish(page.message({ data: JSON.stringify({ server, goals: [3, 4, 5], answer_to: answerTo }) }));
+  const [outcomes] = await collect(new page.roslib.Topic({ ros, name: answerTo, messageType: 'std_msgs/String' }), 1);
+  return JSON.parse(outcomes.data);
 }

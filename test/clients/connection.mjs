@@ -59,7 +59,7 @@ export async function reconnect(page, { hears, says, provides }) {
   await once(listener, 'message');
   talker.publish(page.message({ data: 'after' }));
   page.say({ back: { atLoss, received } });
-  await collect(new page.roslib.Topic({ ros, name: '/go', messageType: 'std_msgs/Empty' }), 1);
+  await page.told();
   ros.removeAllListeners('close');
 }
 

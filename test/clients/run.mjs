@@ -6,13 +6,22 @@
 // LINE is 1 or 2, SCENARIO a function that FILE exports, OPTIONS a JSON object. The same scenario runs with both lines;
 // it gets a `Page` and the options. What it has to say goes out as JSON lines, as the ROS nodes of the tests do it:
 // whatever it `say`s, {"status": …} for each status message that the bridge sends, and at last {"done": its result}.
-// The exit code is 0 only when it got that far. Values that JSON lacks are written as objects with the key `$`.
+// A scenario that waits for the test goes on with SIGUSR2. The exit code is 0 only when it got to its end. Values that JSON lacks are written as objects with the key `$`.
+
+import { EventEmitter } from 'node:events';
 
 import { once } from './wait.mjs';
 
 const [line, url, file, scenario, options] = process.argv.slice(2);
 const module = await import(`roslib${line}`);
 const roslib = module.default ?? module;
+
+const signals = new EventEmitter();
+let pending = 0;
+process.on('SIGUSR2', () => {
+  pending += 1;
+  signals.emit('signal');
+});
 
 class Page {
   line = Number(line);
@@ -60,6 +69,12 @@ class Page {
     this.#hearing.delete(hear);
     ros.setStatusLevel('error', 'level');
     return result;
+  }
+
+  // Until the test says so.
+  async told() {
+    if (pending === 0) await once(signals, 'signal');
+    pending -= 1;
   }
 
   async closeAll() {

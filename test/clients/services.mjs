@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: BSD-3-Clause
 // Services and parameters: calling, and providing with roslib. See run.mjs.
 
-import { once } from './wait.mjs';
+import { collect, once } from './wait.mjs';
 
 const ADD = 'rosbridge_library/AddTwoInts';
 
@@ -29,24 +29,15 @@ export async function giveUp(page, { timeout }) {
 }
 
 // Has the robot, a ROS node, call a service; its answer.
+let asked = 0;
 async function askRobot(page, ros, service, values) {
-  const done = new page.roslib.Topic({ ros, name: '/robot/called', messageType: 'std_msgs/String', queue_length: 100 });
-  const request = JSON.stringify({ service, ...values });
-  const answer = new Promise((resolve) => {
-    const take = (message) => {
-      const { asked, ...result } = JSON.parse(message.data);
-      if (asked === request) {
-        done.unsubscribe(take);
-        resolve(result);
-      }
-    };
-    done.subscribe(take);
-  });
-  const topic = new page.roslib.Topic({ ros, name: '/robot/call', messageType: 'std_msgs/String' });
-  topic.publish(page.message({ data: request }));
-  const result = await answer;
-  topic.unadvertise();
-  return result;
+  asked += 1;
+  const answerTo = `${service}/answer${asked}`;
+  const ask = new page.roslib.Topic({ ros, name: '/robot/call', messageType: 'std_msgs/String' });
+  ask.publish(page.message({ data: JSON.stringify({ service, ...values, answer_to: answerTo }) }));
+  const [answer] = await collect(new page.roslib.Topic({ ros, name: answerTo, messageType: 'std_msgs/String' }), 1);
+  ask.unadvertise();
+  return JSON.parse(answer.data);
 }
 
 // A service in the program, called from ROS and from another client, then taken back.

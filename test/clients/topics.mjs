@@ -47,15 +47,14 @@ export async function twoCallbacks(page) {
   return { first, second };
 }
 
-// Subscribes, unsubscribes without naming a callback, and stays connected until the bridge says on /go that all is
-// seen; then subscribes again with the same Topic.
+// Subscribes, and unsubscribes without naming a callback; when told, subscribes again with the same Topic.
 export async function again(page) {
   const ros = await page.connect();
   const topic = new page.roslib.Topic({ ros, ...COUNT });
   const before = await new Promise((resolve) => topic.subscribe((message) => resolve(message.data)));
   topic.unsubscribe();
   page.say({ unsubscribed: before });
-  await collect(new page.roslib.Topic({ ros, name: '/go', messageType: 'std_msgs/Empty' }), 1);
+  await page.told();
   topic.removeAllListeners('message');
   const after = await new Promise((resolve) => topic.subscribe((message) => resolve(message.data)));
   return { before, after };
@@ -104,10 +103,10 @@ export async function latch(page, { name }) {
   topic.publish(page.message({ data: 'last' }));
   const [late] = await collect(new page.roslib.Topic({ ros: other, ...options }), 1);
   page.say({ published: late.data });
-  await collect(new page.roslib.Topic({ ros, name: '/go', messageType: 'std_msgs/Empty' }), 1);
+  await page.told();
   topic.unadvertise();
   page.say({ unadvertised: name });
-  await collect(new page.roslib.Topic({ ros, name: '/go_on', messageType: 'std_msgs/Empty' }), 1);
+  await page.told();
 }
 
 // Messages from one connection to another, in order, while a third listens with CBOR.

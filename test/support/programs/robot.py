@@ -7,9 +7,11 @@
 /robot/add fail hang nested send_bytes    services
 /robot/count_to         a SimpleActionServer: counts to the goal, 20 ms a step; a negative goal is aborted
 /robot/tasks            an ActionServer that does the same, for several goals at once
-/robot/call             has the robot call a service: {"service", "a", "b"}; the outcome comes on /robot/called
-/robot/send_goals       has it send goals one after the other: {"server", "goals"}, cancelling goal 5 when it has
-                        feedback; the outcomes come on /robot/goal_done, feedback on /robot/goal_feedback
+/robot/call             has the robot call a service: {"service", "a", "b", "answer_to"}
+/robot/send_goals       has it send goals one after the other: {"server", "goals", "answer_to"}; goal 5 is cancelled
+                        when it has feedback; /robot/goal_feedback is the feedback last noted, latched
+
+What comes of a call or of the goals is published as JSON, latched, on the topic that `answer_to` names.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ import functools
 import json
 import threading
 import time
-from typing import Any, Callable
+from typing import Any, Callable, Dict
 
 import actionlib
 import rospy
@@ -122,9 +124,12 @@ def serve_action() -> None:
     server.start()
 
 
-def call_for_clients() -> None:
-    called = rospy.Publisher("/robot/called", String, queue_size=100)
+def answer(topic: str, outcome: Any) -> None:
+    """Latched, so that it gets to who asked however long the subscription takes."""
+    rospy.Publisher(topic, String, latch=True, queue_size=1).publish(json.dumps(outcome))
 
+
+def call_for_clients() -> None:
     @in_thread
     def call(message: String) -> None:
         wanted = json.loads(message.data)
@@ -133,41 +138,41 @@ def call_for_clients() -> None:
             outcome = {"sum": rospy.ServiceProxy(wanted["service"], AddTwoInts)(wanted["a"], wanted["b"]).sum}
         except (rospy.ROSException, rospy.ServiceException) as error:
             outcome = {"error": str(error)}
-        called.publish(json.dumps({"asked": message.data, **outcome}))
+        answer(wanted["answer_to"], outcome)
 
     rospy.Subscriber("/robot/call", String, call)
 
 
 def send_goals_for_clients() -> None:
-    done = rospy.Publisher("/robot/goal_done", String, queue_size=100)
-    noted = rospy.Publisher("/robot/goal_feedback", Int32, queue_size=100)
+    noted = rospy.Publisher("/robot/goal_feedback", Int32, latch=True, queue_size=1)
 
     @in_thread
     def send(message: String) -> None:
         wanted = json.loads(message.data)
         client = actionlib.SimpleActionClient(wanted["server"], TestAction)
-        if not client.wait_for_server(rospy.Duration(5.0)):
-            done.publish(json.dumps({"error": "no server"}))
-            return
-        for goal in wanted["goals"]:
-            feedback = []
+        if client.wait_for_server(rospy.Duration(10.0)):
+            answer(wanted["answer_to"], [carry_out(client, goal) for goal in wanted["goals"]])
+        else:
+            answer(wanted["answer_to"], {"error": "no server"})
 
-            def note(message: TestFeedback, goal: int = goal, feedback: Any = feedback) -> None:
-                feedback.append(message.feedback)
-                noted.publish(message.feedback)
-                if goal == 5:
-                    client.cancel_goal()
+    def carry_out(client: actionlib.SimpleActionClient, goal: int) -> Dict[str, Any]:
+        feedback = []
 
-            client.send_goal(TestGoal(goal), feedback_cb=note)
-            finished = client.wait_for_result(rospy.Duration(5.0))
-            result = client.get_result()
-            outcome = {
-                "finished": finished,
-                "state": client.get_state(),
-                "result": result.result if result is not None else None,
-                "feedback": feedback,
-            }
-            done.publish(json.dumps(outcome))
+        def note(message: TestFeedback) -> None:
+            feedback.append(message.feedback)
+            noted.publish(message.feedback)
+            if goal == 5:
+                client.cancel_goal()
+
+        client.send_goal(TestGoal(goal), feedback_cb=note)
+        finished = client.wait_for_result(rospy.Duration(10.0))
+        result = client.get_result()
+        return {
+            "finished": finished,
+            "state": client.get_state(),
+            "result": None if result is None else result.result,
+            "feedback": feedback,
+        }
 
     rospy.Subscriber("/robot/send_goals", String, send)
 
