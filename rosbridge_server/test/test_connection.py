@@ -304,6 +304,28 @@ def test_text_that_is_not_utf8_keeps_the_connection() -> None:
     asyncio.run(run())
 
 
+def test_a_client_that_pings_and_does_not_read_gets_the_newest_pong() -> None:
+    async def run() -> None:
+        async with serving() as running:
+            reader, writer = await running.raw()
+            running.last.outbox.send(Payload([bytes(20 * MIB)], binary=True))  # more than the kernel takes
+            for number in range(1000):
+                writer.write(masked(9, b"%03d" % number))
+            writer.write(masked(1, b"the end of the pings"))
+            await until(lambda: running.last.received)
+            header_and_body = await reader.readexactly(10 + 20 * MIB)
+            assert header_and_body[:2] == b"\x82\x7f"
+            pongs = b""
+            while b"the end of the pings" not in pongs or b"\x8a\x03999" not in pongs:
+                piece = await asyncio.wait_for(reader.read(65536), 10)
+                assert piece
+                pongs += piece
+            assert pongs.count(b"\x8a\x03") < 5
+            writer.close()
+
+    asyncio.run(run())
+
+
 def test_a_close_is_answered_and_finishes_the_protocol_once() -> None:
     async def run() -> None:
         async with serving() as running:

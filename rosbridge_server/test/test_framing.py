@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import struct
 import time
@@ -94,6 +95,16 @@ def test_messages_come_out_however_they_are_cut(sent: List[Tuple[int, bytes]], d
     got = read(reader, *(stream[a:b] for a, b in zip([0, *cuts], [*cuts, len(stream)])))
     assert [message for message in got if message[0] != PING] == sent
     assert got.count((PING, b"?")) == pings
+
+
+@given(st.binary(max_size=200), st.booleans(), st.integers(0, 50))
+def test_any_bytes_give_messages_or_a_frame_error(stream: bytes, extensions: bool, limit: int) -> None:
+    reader = FrameReader(limit, extensions)
+    got: List[Message] = []
+    with contextlib.suppress(FrameError):
+        for piece in (stream[:7], stream[7:]):
+            got += reader.feed(piece)
+    assert all(len(message.data) <= max(limit, 125) for message in got)
 
 
 def test_one_byte_at_a_time() -> None:

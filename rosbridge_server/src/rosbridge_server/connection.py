@@ -18,6 +18,7 @@ import zlib
 from typing import Callable, Optional, Tuple
 
 from tornado import websocket
+from tornado.concurrent import Future
 from tornado.iostream import StreamClosedError
 
 from rosbridge_library.payload import Buffer, Payload
@@ -61,6 +62,8 @@ class WebSocketConnection(websocket.WebSocketProtocol13):
         self._ping_timeout: float = handler.ping_timeout or 0
         self._lost = lost
         self._keepalive: Optional[KeepAlive] = None
+        self._pong: Optional[Future[None]] = None
+        self._late_ping: Optional[bytes] = None
 
     def start_pinging(self) -> None:
         """Overrides Tornado's, which can't have a timeout longer than the interval."""
@@ -151,7 +154,7 @@ class WebSocketConnection(websocket.WebSocketProtocol13):
         """Handle one message; what to wait for before the next, if anything."""
         opcode, data = message.opcode, message.data
         if opcode == framing.PING:
-            self._send_pong(data)
+            self._answer_ping(data)
         elif opcode == framing.CLOSE:
             self.client_terminated = True
             self.close_code = struct.unpack("!H", data[:2])[0] if len(data) >= 2 else None
@@ -162,6 +165,20 @@ class WebSocketConnection(websocket.WebSocketProtocol13):
                 data = self._inflate(data)
             return self._run_callback(self.handler.on_message, data)
         return None
+
+    def _answer_ping(self, data: bytes) -> None:
+        """Sends a pong. While one waits to be sent, only the newest ping is remembered: a client that pings and
+        does not read must not fill the memory (RFC 6455, section 5.5.3)."""
+        if self._pong is not None and not self._pong.done():
+            self._late_ping = data
+        elif not self.is_closing():
+            self._late_ping = None
+            self._pong = self.stream.write(framing.frame_header(framing.PONG, len(data)) + data)
+            self._pong.add_done_callback(self._pong_sent)
+
+    def _pong_sent(self, pong: Future[None]) -> None:
+        if pong.exception() is None and self._late_ping is not None:
+            self._answer_ping(self._late_ping)
 
     def _inflate(self, data: bytes) -> bytes:
         assert self._decompressor is not None

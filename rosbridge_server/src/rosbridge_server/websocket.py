@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
+import resource
 import signal
 import sys
 import threading
@@ -19,6 +20,7 @@ from typing import TYPE_CHECKING, Any, List, Mapping, Optional, Set
 from rosbridge_server.settings import Settings, SettingsError, help_text, load, read_flags, usage
 
 if TYPE_CHECKING:
+    from rosbridge_library.ros.master import Master
     from rosbridge_library.ros.node import Node
     from rosbridge_server.server import WebSocketServer
 
@@ -62,11 +64,20 @@ def _run(flags: Mapping[str, Any]) -> int:
     import rosgraph
     import rospy
 
+    # All that is needed, so that a package which is missing is told at once, and not when a master has come.
+    import rosbridge_library.rosbridge_protocol  # noqa: F401
+    import rosbridge_server.clients
+    import rosbridge_server.server  # noqa: F401
     from rosbridge_server.logs import route_to_ros
 
     if not rosgraph.is_master_online():
         print(f"{_NAME}: waiting for the ROS master at {rosgraph.get_master_uri()}", file=sys.stderr, flush=True)
-    rospy.init_node(_NAME, disable_signals=True)
+    try:
+        rospy.init_node(_NAME, disable_signals=True)
+    except rospy.ROSException as error:
+        print(f"{_NAME}: {error}", file=sys.stderr)
+        return _leave(1)
+    _raise_file_limit()
     stop_logging = route_to_ros()
     try:
         settings = load(Settings, rospy.get_param(rospy.get_name(), {}), flags)
@@ -79,6 +90,9 @@ def _run(flags: Mapping[str, Any]) -> int:
         code = loop.run_until_complete(_serve(settings))
     except SettingsError as error:
         logger.critical("%s", error)
+        code = 1
+    except Exception:
+        logger.exception("The server ends because of an internal error")
         code = 1
     finally:
         stop_logging()
@@ -158,9 +172,14 @@ async def _start(settings: Settings, node: Node) -> WebSocketServer:
 async def _end(server: Optional[WebSocketServer], node: Node, ros_ended: threading.Event) -> None:
     import rospy
 
+    node_uri: str = rospy.get_node_uri()
+    done = threading.Event()
+
     def end_ros() -> None:
         rospy.signal_shutdown("rosbridge_websocket ends")
         ros_ended.wait(_ROS_S)  # when ROS ended the node, another thread is at it
+        _unregister_everything(node.master, node_uri)
+        done.set()
 
     if server is not None:
         server.close()
@@ -168,7 +187,26 @@ async def _end(server: Optional[WebSocketServer], node: Node, ros_ended: threadi
     await node.stop()
     # A thread that is a daemon, since a master that does not answer may hold it for as long as it likes.
     threading.Thread(target=end_ros, daemon=True).start()
-    await asyncio.get_event_loop().run_in_executor(None, ros_ended.wait, _ROS_S)
+    await asyncio.get_event_loop().run_in_executor(None, done.wait, _ROS_S)
+
+
+def _unregister_everything(master: Master, node_uri: str) -> None:
+    """Removes what the master still knows of this node.
+
+    rospy unregisters what it knows of when it ends. What clients gave up just before may be known to neither.
+    """
+    from rosbridge_library.ros.master import MasterError, MasterUnreachable
+
+    me = master.caller_id
+    try:
+        publishers, subscribers, services = master.call("getSystemState")
+        for method, entries in (("unregisterPublisher", publishers), ("unregisterSubscriber", subscribers)):
+            for topic in [name for name, nodes in entries if me in nodes]:
+                master.call(method, topic, node_uri)
+        for service in [name for name, nodes in services if me in nodes]:
+            master.call("unregisterService", service, master.call("lookupService", service))
+    except (MasterError, MasterUnreachable) as error:
+        logger.warning("The master may still know this node's topics: %s", error)
 
 
 def _leave(code: int) -> int:
@@ -181,6 +219,12 @@ def _exit_in(seconds: float, code: int) -> None:
     timer = threading.Timer(seconds, os._exit, (code,))
     timer.daemon = True
     timer.start()
+
+
+def _raise_file_limit() -> None:
+    """Each client takes a file descriptor, and many systems give a process 1024 of them unless it asks for more."""
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
 
 
 def _remedy(error: ModuleNotFoundError) -> str:
