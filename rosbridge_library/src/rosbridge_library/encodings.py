@@ -14,21 +14,28 @@ import itertools
 import math
 import struct
 import zlib
-from typing import Any, Callable, Dict, Iterator, List, Mapping, Optional
+from typing import Any, Callable, Dict, Iterable, Iterator, List, Mapping, Optional
 
 import cbor2
 import png
 
-from rosbridge_library.codec import MessageType, encode_cbor, encode_json
-from rosbridge_library.internal.exceptions import DecodeError
+from rosbridge_library.codec import Field, MessageType, encode_cbor, encode_json
+from rosbridge_library.internal.exceptions import DecodeError, RosbridgeError
 from rosbridge_library.payload import Payload
 from rosbridge_library.ros.message import Message
 
 MAX_PNG_BYTES = 256 * 1024 * 1024
 """What a client's PNG may decode to: a small image can hold a great many zeros."""
 
+BSON_IF_BINARY = "bson-if-binary"
+"""The encoding of `binary_encoder: bson`: messages whose type has byte arrays are BSON, all else is JSON."""
+
 _UINT32 = struct.Struct(">I")
 _fragment_ids: Iterator[int] = itertools.count()
+
+
+class EncodeError(RosbridgeError):
+    """An encoding has no form for a message."""
 
 
 def encode_operation(operation: Mapping[str, Any], encoding: str = "none") -> Payload:
@@ -47,7 +54,10 @@ def _cbor_operation(operation: Mapping[str, Any]) -> Payload:
 def _bson_operation(operation: Mapping[str, Any]) -> Payload:
     import bson  # optional: only BSON mode needs it
 
-    return Payload([bson.encode(operation)], binary=True)
+    try:
+        return Payload([bson.encode(operation)], binary=True)
+    except (OverflowError, bson.errors.BSONError) as error:
+        raise EncodeError(f"BSON can't hold it: {error}") from error
 
 
 def _png_operation(operation: Mapping[str, Any]) -> Payload:
@@ -59,6 +69,7 @@ OPERATION_ENCODINGS: Dict[str, Callable[[Mapping[str, Any]], Payload]] = {
     "png": _png_operation,
     "cbor": _cbor_operation,
     "bson": _bson_operation,
+    BSON_IF_BINARY: _json_operation,
 }
 
 
@@ -74,7 +85,7 @@ def service_response(type_: MessageType, wire: bytes, envelope: Mapping[str, Any
 
 def _with_message(envelope: Mapping[str, Any], field: str, type_: MessageType, wire: bytes, encoding: str) -> Payload:
     """The operation `envelope` with one more field, a ROS message; the encodings are those of operations."""
-    if encoding == "bson":
+    if encoding == "bson" or (encoding == BSON_IF_BINARY and _has_binary(type_)):
         return _bson_operation({**envelope, field: type_.to_values(wire)})
     if encoding == "cbor":
         head = encode_cbor(envelope)  # a map of fewer than 23 entries: its first byte is 0xa0 + their number
@@ -95,7 +106,7 @@ def _cbor_head(topic: str) -> bytes:
 
 
 def _publish_json(topic: str, message: Message) -> Payload:
-    return Payload([_json_head(topic), message.type.to_json(message.wire), b"}"])
+    return Payload([_json_head(topic), *message.type.json_pieces(message.wire), b"}"])
 
 
 def _publish_png(topic: str, message: Message) -> Payload:
@@ -103,7 +114,7 @@ def _publish_png(topic: str, message: Message) -> Payload:
 
 
 def _publish_cbor(topic: str, message: Message) -> Payload:
-    return Payload([_cbor_head(topic), message.type.to_cbor(message.wire)], binary=True)
+    return Payload([_cbor_head(topic), *message.type.cbor_pieces(message.wire)], binary=True)
 
 
 def _publish_cbor_raw(topic: str, message: Message) -> Payload:
@@ -127,12 +138,29 @@ def _publish_bson(topic: str, message: Message) -> Payload:
     return _bson_operation({"op": "publish", "topic": topic, "msg": message.type.to_values(message.wire)})
 
 
+def _publish_bson_if_binary(topic: str, message: Message) -> Payload:
+    return (_publish_bson if _has_binary(message.type) else _publish_json)(topic, message)
+
+
+@functools.lru_cache(maxsize=1024)
+def _has_binary(type_: MessageType) -> bool:
+    """Whether a message of this type has byte arrays anywhere in it."""
+
+    def any_binary(fields: Iterable[Field]) -> bool:
+        return any(
+            field.is_binary or (field.message is not None and any_binary(field.message.fields)) for field in fields
+        )
+
+    return any_binary(type_.fields)
+
+
 TOPIC_ENCODINGS: Dict[str, Callable[[str, Message], Payload]] = {
     "none": _publish_json,
     "png": _publish_png,
     "cbor": _publish_cbor,
     "cbor-raw": _publish_cbor_raw,
     "bson": _publish_bson,
+    BSON_IF_BINARY: _publish_bson_if_binary,
 }
 
 

@@ -32,7 +32,7 @@ from typing import (
 
 from rosbridge_library.capability import Capability, Operation, OperationId, checked_id
 from rosbridge_library.codec import decode_cbor, decode_json
-from rosbridge_library.encodings import encode_operation, in_fragments
+from rosbridge_library.encodings import BSON_IF_BINARY, encode_operation, in_fragments
 from rosbridge_library.internal.exceptions import (
     DecodeError,
     InvalidArgumentException,
@@ -258,7 +258,11 @@ class Protocol:
 
     def encoding(self, compression: str) -> str:
         """The encoding for a client that asked for `compression`."""
-        return "bson" if self.parameters.bson_only_mode else compression
+        if self.parameters.bson_only_mode:
+            return "bson"
+        if compression == "none" and self.parameters.binary_encoder == "bson":
+            return BSON_IF_BINARY
+        return compression
 
     def fragment_size(self, asked: Optional[int]) -> Optional[int]:
         """The length above which messages go out in fragments; the server's max_message_size is a limit too."""

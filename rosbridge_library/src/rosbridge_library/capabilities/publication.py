@@ -68,7 +68,7 @@ class Publications:
         if not self.node.access.may_publish(name):
             raise AccessDenied(f"the server does not let clients publish {topic}")
         name = self.node.resolve(name)
-        info = await self._look_up(name, advertise_id)
+        info = await self._look_up(name, type_name, advertise_id)
         type_ = await self._type(name, type_name, info)
         self._may_still_open(name, type_)
         publisher = self.node.publishers.open(
@@ -104,11 +104,13 @@ class Publications:
         if ours is not None and ours.users and ours.type.name != type_.name:
             raise TopicConflict(f"{name} is already advertised by clients as {ours.type.name}, not {type_.name}")
 
-    async def _look_up(self, name: str, lid: OperationId) -> Optional[TopicInfo]:
-        """What the master says, or None, with the client told, while it is away."""
+    async def _look_up(self, name: str, type_name: Optional[str], lid: OperationId) -> Optional[TopicInfo]:
+        """What the master says, or None, with the client told, while it is away and the type is known without it."""
         try:
             return await self.node.topic(name)
         except (MasterUnreachable, RosTimeout) as error:
+            if type_name is None and self.node.publishers.get(name) is None:
+                raise
             self._protocol.log("error", f"{error}; {name} will be advertised when it is back", lid)
             return None
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Awaitable, Deque, Dict, Hashable, List, NamedT
 from rosbridge_library.capabilities.publication import AccessDenied, TopicConflict
 from rosbridge_library.capability import Capability, Operation, on_loop
 from rosbridge_library.codec import get_message_type
-from rosbridge_library.encodings import TOPIC_ENCODINGS, in_fragments
+from rosbridge_library.encodings import TOPIC_ENCODINGS, EncodeError, in_fragments
 from rosbridge_library.internal.exceptions import InvalidArgumentException, TypeLoadError, WireError
 from rosbridge_library.internal.ros_loader import canonical_type_name
 from rosbridge_library.names import checked_global_name
@@ -184,7 +184,9 @@ class Stream(Sink):
             return message.encoded((self._compression, self.topic, self._fragment_size), self._encode)
         except WireError as error:
             self._tell_once(f"subscribe: a message on {self.topic} is no {message.type.name}: {error}")
-            return ()
+        except EncodeError as error:
+            self._tell_once(f"subscribe: a message on {self.topic} is dropped: {error}")
+        return ()
 
     def _encode(self, message: Message) -> List[Payload]:
         payload = TOPIC_ENCODINGS[self._compression](self.topic, message)
@@ -271,12 +273,21 @@ class Subscribe(Capability):
 
     async def _confirm(self, stream: Stream, message: Operation) -> None:
         troubles = await stream.feed.live()
+        if troubles and await self._reaches_all_publishers(stream.feed):
+            troubles = []  # the master also lists the old address of a node that died and was started again
         lid = message.get("id")
         if self._streams.get(stream.topic) is not stream or lid not in stream.wishes:
             return
         for trouble in troubles:
             self.protocol.log("error", f"subscribe: {trouble}", lid)
         self.protocol.log("info", f"subscribe: {stream.topic} is subscribed to", lid)
+
+    async def _reaches_all_publishers(self, feed: Feed) -> bool:
+        try:
+            info = await self.protocol.node.topic(feed.topic)
+        except (MasterUnreachable, MasterError, RosTimeout):
+            return False
+        return set(info.publishers) <= {publication.node for publication in feed.publications}
 
     @on_loop
     def unsubscribe(self, message: Operation) -> None:

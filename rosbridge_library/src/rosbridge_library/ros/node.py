@@ -38,6 +38,8 @@ logger = logging.getLogger("rosbridge.node")
 
 CALL_THREADS = 16
 MASTER_TIMEOUT_S = 5.0
+CALL_TIMEOUT_S = MASTER_TIMEOUT_S + 1.0
+"""Longer, because what a call to the master says when its own time is over tells more."""
 DEFAULT_UNREGISTER_TIMEOUT_S = 10.0
 
 T = TypeVar("T")
@@ -99,7 +101,7 @@ class Node:
         await self.loop.run_in_executor(None, self._registrar.close)
         self._threads.shutdown(wait=False)
 
-    async def call(self, function: Callable[..., T], *args: Any, timeout: Optional[float] = MASTER_TIMEOUT_S) -> T:
+    async def call(self, function: Callable[..., T], *args: Any, timeout: Optional[float] = CALL_TIMEOUT_S) -> T:
         """What the blocking `function(*args)` returns, run on the thread pool.
 
         Raises RosTimeout after `timeout` seconds (the thread then goes on by itself, so `function` needs a deadline
