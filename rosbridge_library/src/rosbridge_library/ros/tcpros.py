@@ -24,8 +24,10 @@ import threading
 from collections import deque
 from typing import Any, Callable, Deque, Dict, List, Optional, Tuple
 
+import genpy
 import rospy
 from rosgraph.network import use_ipv6
+from roslib.message import get_message_class
 from rospy.impl.registration import get_topic_manager
 from rospy.impl.tcpros_base import TCPROS, TCPROSTransport
 from rospy.impl.tcpros_pubsub import TCPROSHandler, TCPROSPub, TCPROSSub
@@ -42,6 +44,7 @@ MAX_MESSAGE_BYTES = 1 << 30
 """A length above this is taken for a corrupt stream, which closes the connection."""
 CONNECT_TIMEOUT_S = 10.0
 RETRY_FIRST_S, RETRY_MAX_S = 0.2, 10.0
+MAX_WAITING_CALLS = 1000
 MAX_QUEUED_BYTES = 64 * 1024 * 1024
 """How much may wait for one subscriber of a topic that the bridge publishes."""
 
@@ -188,6 +191,7 @@ class InboundConnection(_LoopTransport):
         self._buffered = 0
         self._large: Optional[memoryview] = None
         self._large_read = 0
+        self._calls: Optional[_RospyCalls] = None
 
     def start(self) -> None:
         """Begin to connect and read."""
@@ -197,6 +201,8 @@ class InboundConnection(_LoopTransport):
     def _close_on_loop(self) -> None:
         if self._task is not None and self._task is not asyncio.current_task(self.loop):
             self._task.cancel()
+        if self._calls is not None:
+            self._calls.close()
         super()._close_on_loop()
 
     async def _run(self) -> None:
@@ -211,6 +217,8 @@ class InboundConnection(_LoopTransport):
                     logger.debug("%s: no connection to %s: %s", self.topic, self.endpoint_id, reason)
                     self._tell("refused", reason)
                 else:
+                    if self.done:  # before Python 3.12 wait_for may swallow a cancellation that comes at its end
+                        break
                     delay_s = RETRY_FIRST_S
                     reason = await self._receive()
                     logger.debug("%s: connection to %s ended: %s", self.topic, self.endpoint_id, reason)
@@ -367,14 +375,67 @@ class InboundConnection(_LoopTransport):
         if receiver is not None:
             receiver.received(self, wire)
         if self._subscriber.callbacks:
-            self._call_rospy(wire)
+            if self._calls is None:
+                self._calls = _RospyCalls(self, self._subscriber)
+            self._calls.put(wire)
 
-    def _call_rospy(self, wire: Wire) -> None:
-        """Serve rospy's own subscribers in this process, such as the one that follows /clock."""
-        message = self._subscriber.data_class()
-        message.deserialize(bytes(wire))
-        message._connection_header = self.header
-        self._subscriber.receive_callback([message], self)
+
+class _RospyCalls(threading.Thread):
+    """Serves rospy's own subscribers of a topic, in a program that has such, on a thread of theirs: they may block.
+
+    What follows /clock is called at once instead: no message may be older than the time that it is received at.
+    """
+
+    def __init__(self, connection: InboundConnection, subscriber: Any) -> None:
+        super().__init__(name=f"rospy-calls{connection.topic}", daemon=True)
+        self._connection = connection
+        self._subscriber = subscriber
+        self._waiting: Deque[Wire] = deque(maxlen=subscriber.queue_size or MAX_WAITING_CALLS)
+        self._changed = threading.Condition()
+        self._closed = False
+
+    def put(self, wire: Wire) -> None:
+        """Have the subscribers called with this message; the oldest ones that wait give way."""
+        if all(
+            str(getattr(callback, "__module__", "")).startswith("rospy.")
+            for callback, _ in self._subscriber.callbacks or ()
+        ):
+            self._call(wire)
+            return
+        with self._changed:
+            self._waiting.append(wire)
+            self._changed.notify()
+        if self.ident is None:
+            self.start()
+
+    def close(self) -> None:
+        """End the thread, once a call that it is in returns."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+
+    def run(self) -> None:
+        while True:
+            with self._changed:
+                while not self._waiting and not self._closed:
+                    self._changed.wait()
+                if self._closed:
+                    return
+                wire = self._waiting.popleft()
+            self._call(wire)
+
+    def _call(self, wire: Wire) -> None:
+        header = self._connection.header
+        # A feed's subscriber, which rospy's joined, has a class without fields.
+        cls = self._subscriber.data_class if self._subscriber.data_class.__slots__ else None
+        try:
+            message = (cls or get_message_class(header["type"]) or rospy.AnyMsg)()
+            message.deserialize(bytes(wire))
+        except genpy.DeserializationError as error:
+            logger.error("%s: a message is no %s: %s", self._connection.topic, header["type"], error)
+            return
+        message._connection_header = header
+        self._subscriber.receive_callback([message], self._connection)
 
 
 class OutboundConnection(_LoopTransport):
