@@ -246,6 +246,15 @@ def test_an_omitted_header_is_filled_and_not_reported() -> None:
     assert (stamped.to_values(wire)["header"], missing) == (given, [])
 
 
+def test_null_in_a_header_is_a_field_left_out() -> None:
+    """roslibpy sends it for what its program did not give."""
+    stamped = get_message_type("geometry_msgs/PointStamped")
+    header = {"seq": None, "stamp": None, "frame_id": None}
+    wire, missing = stamped.from_values({"point": {"x": 0, "y": 0, "z": 0}, "header": header}, now)
+    filled = {"seq": 0, "stamp": {"secs": 1700000000, "nsecs": 5}, "frame_id": ""}
+    assert (stamped.to_values(wire)["header"], missing) == (filled, ["header.frame_id"])
+
+
 def test_headers_of_elements_are_filled_too() -> None:
     path = get_message_type("nav_msgs/Path")
     wire, missing = path.from_values({"poses": [{}, {"header": {"frame_id": "a"}}]}, now)

@@ -4,7 +4,10 @@
 from __future__ import annotations
 
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import ModuleType
 from typing import Any, Callable
 
 import genpy
@@ -123,3 +126,30 @@ def test_a_package_that_fails_to_import_says_why(tmp_path: Path, monkeypatch: py
     with pytest.raises(InvalidModuleException, match="out of order"):
         get_message_class("broken_msgs/Thing")
     sys.modules.pop("broken_msgs", None)
+
+
+def test_a_module_that_another_thread_is_importing_is_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Calls that come at once on a bridge that has just started."""
+    gate: Any = ModuleType("loader_gate")
+    gate.inside, gate.open = threading.Event(), threading.Event()
+    monkeypatch.setitem(sys.modules, "loader_gate", gate)
+    package = tmp_path / "slow_import_msgs" / "msg"
+    package.mkdir(parents=True)
+    (package.parent / "__init__.py").touch()
+    (package / "__init__.py").write_text(
+        "import loader_gate\n"
+        "loader_gate.inside.set()\n"
+        "assert loader_gate.open.wait(10)\n"
+        "from std_msgs.msg import String\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with ThreadPoolExecutor(2) as threads:
+        first = threads.submit(get_message_class, "slow_import_msgs/String")
+        assert gate.inside.wait(10)
+        second = threads.submit(get_message_class, "slow_import_msgs/String")
+        opening = threading.Timer(0.1, gate.open.set)  # by then the second one has met the half-imported module
+        opening.start()
+        assert second.result(10) is String
+        assert first.result(10) is String

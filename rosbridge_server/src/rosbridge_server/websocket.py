@@ -20,7 +20,6 @@ from typing import TYPE_CHECKING, Any, List, Mapping, Optional, Set
 from rosbridge_server.settings import Settings, SettingsError, help_text, load, read_flags, usage
 
 if TYPE_CHECKING:
-    from rosbridge_library.ros.master import Master
     from rosbridge_library.ros.node import Node
     from rosbridge_server.server import WebSocketServer
 
@@ -172,13 +171,11 @@ async def _start(settings: Settings, node: Node) -> WebSocketServer:
 async def _end(server: Optional[WebSocketServer], node: Node, ros_ended: threading.Event) -> None:
     import rospy
 
-    node_uri: str = rospy.get_node_uri()
     done = threading.Event()
 
     def end_ros() -> None:
         rospy.signal_shutdown("rosbridge_websocket ends")
         ros_ended.wait(_ROS_S)  # when ROS ended the node, another thread is at it
-        _unregister_everything(node.master, node_uri)
         done.set()
 
     if server is not None:
@@ -188,25 +185,6 @@ async def _end(server: Optional[WebSocketServer], node: Node, ros_ended: threadi
     # A thread that is a daemon, since a master that does not answer may hold it for as long as it likes.
     threading.Thread(target=end_ros, daemon=True).start()
     await asyncio.get_event_loop().run_in_executor(None, done.wait, _ROS_S)
-
-
-def _unregister_everything(master: Master, node_uri: str) -> None:
-    """Removes what the master still knows of this node.
-
-    rospy unregisters what it knows of when it ends. What clients gave up just before may be known to neither.
-    """
-    from rosbridge_library.ros.master import MasterError, MasterUnreachable
-
-    me = master.caller_id
-    try:
-        publishers, subscribers, services = master.call("getSystemState")
-        for method, entries in (("unregisterPublisher", publishers), ("unregisterSubscriber", subscribers)):
-            for topic in [name for name, nodes in entries if me in nodes]:
-                master.call(method, topic, node_uri)
-        for service in [name for name, nodes in services if me in nodes]:
-            master.call("unregisterService", service, master.call("lookupService", service))
-    except (MasterError, MasterUnreachable) as error:
-        logger.warning("The master may still know this node's topics: %s", error)
 
 
 def _leave(code: int) -> int:

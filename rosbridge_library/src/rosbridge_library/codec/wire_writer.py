@@ -30,6 +30,9 @@ class _WireWriter:
         variables = self._fetch(value, [field.name for field in plan.fields], path)
         is_header = is_header_plan(plan)
         for field, variable in zip(plan.fields, variables):
+            if is_header:  # roslibpy sends null for what its program did not give
+                with self.source.block(f"if {variable} is None:"):
+                    self.source.line(f"{variable} = LEFT_OUT")
             if is_header and field.name == "seq":
                 with self.source.block(f"if {variable} is LEFT_OUT:"):
                     self.source.line(f"{variable} = 0")

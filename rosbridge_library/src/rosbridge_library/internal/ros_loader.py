@@ -112,7 +112,7 @@ def _load_module(package: str, kind: str) -> ModuleType:
     """
     name = f"{package}.{kind}"
     if name in sys.modules:
-        return sys.modules[name]
+        return importlib.import_module(name)  # waits for a thread that is importing it
     importlib.invalidate_caches()
     try:
         spec = importlib.util.find_spec(package)

@@ -32,7 +32,7 @@ from rosbridge_library.ros.master import Master, MasterError, MasterUnreachable
 logger = logging.getLogger("rosbridge.registrar")
 
 CHECK_INTERVAL_S = 1.0
-CLOSE_TIMEOUT_S = 0.5
+CLOSE_TIMEOUT_S = 1.0
 
 
 class Entry(NamedTuple):
@@ -87,7 +87,7 @@ class Registrar(RegistrationListener):  # type: ignore[misc]  # rospy has no typ
         self._thread.start()
 
     def close(self) -> None:
-        """End the thread; blocks until it has ended, or the master takes longer than `CLOSE_TIMEOUT_S`.
+        """End the thread once it has unregistered what was removed; blocks until then, or for `CLOSE_TIMEOUT_S`.
 
         What is registered stays so: rospy unregisters it all in one call when it shuts down.
         """
@@ -147,8 +147,7 @@ class Registrar(RegistrationListener):  # type: ignore[misc]  # rospy has no typ
             with self._changed:
                 if not self._stale or self.trouble:
                     self._changed.wait(CHECK_INTERVAL_S)
-                if self._closed:
-                    return
+                closed = self._closed
                 wanted, stale = dict(self._wanted), self._stale
                 self._stale = set()
             try:
@@ -160,14 +159,14 @@ class Registrar(RegistrationListener):  # type: ignore[misc]  # rospy has no typ
                     self._stale |= stale
             except Exception:  # a bug; without this thread nothing would ever be registered again
                 logger.exception("registering with the master failed")
+            if closed:
+                return
 
     def _reconcile(self, wanted: Dict[Entry, str], stale: Set[Entry]) -> None:
-        if (not stale or self.trouble) and not self._master_knows_us():
+        if not self._closed and (not stale or self.trouble) and not self._master_knows_us():
             logger.warning("the master at %s has forgotten this node; registering everything again", self._master.uri)
             self._known.clear()
         for entry in [each for each in self._known if each not in wanted]:
-            if self._closed:
-                return
             self._unregister(entry, self._known[entry])
         for entry, type_or_uri in wanted.items():
             if self._closed:
