@@ -14,16 +14,17 @@ import itertools
 import math
 import struct
 import zlib
-from typing import Any, Callable, Dict, Iterable, Iterator, List, Mapping, Optional
+from typing import Any, Callable, Dict, Iterable, Iterator, List, Mapping, Optional, Sequence
 
 import cbor2
 import png
 
 from rosbridge_library.codec import Field, MessageType, encode_cbor, encode_json
 from rosbridge_library.internal.exceptions import DecodeError, RosbridgeError
-from rosbridge_library.payload import Payload
+from rosbridge_library.payload import Buffer, Payload
 from rosbridge_library.ros.message import Message
 
+MAX_PIECES = 16
 MAX_PNG_BYTES = 256 * 1024 * 1024
 """What a client's PNG may decode to: a small image can hold a great many zeros."""
 
@@ -105,8 +106,13 @@ def _cbor_head(topic: str) -> bytes:
     return b"\xa3" + b"".join(map(cbor2.dumps, ("op", "publish", "topic", topic, "msg")))
 
 
+def _few(pieces: Sequence[Buffer]) -> Sequence[Buffer]:
+    """Pieces of a message, where it pays to write them as they are: that keeps a large array uncopied."""
+    return pieces if len(pieces) <= MAX_PIECES else (b"".join(pieces),)
+
+
 def _publish_json(topic: str, message: Message) -> Payload:
-    return Payload([_json_head(topic), *message.type.json_pieces(message.wire), b"}"])
+    return Payload([_json_head(topic), *_few(message.type.json_pieces(message.wire)), b"}"])
 
 
 def _publish_png(topic: str, message: Message) -> Payload:
@@ -114,7 +120,7 @@ def _publish_png(topic: str, message: Message) -> Payload:
 
 
 def _publish_cbor(topic: str, message: Message) -> Payload:
-    return Payload([_cbor_head(topic), *message.type.cbor_pieces(message.wire)], binary=True)
+    return Payload([_cbor_head(topic), *_few(message.type.cbor_pieces(message.wire))], binary=True)
 
 
 def _publish_cbor_raw(topic: str, message: Message) -> Payload:

@@ -24,6 +24,10 @@ _JOIN_BYTES = 65536
 """Buffers up to this size are joined for the stream, which would make a system call of each."""
 
 
+_MAX_BUFFERS = 1024
+"""IOV_MAX of Linux: `sendmsg` refuses more."""
+
+
 class StreamTransport:
     """An `outbox.Transport` over ``stream``, with ``frame`` as its framing.
 
@@ -47,6 +51,8 @@ class StreamTransport:
         if stream.closed():
             return True
         if self._plain and not stream.writing():
+            if len(buffers) > _MAX_BUFFERS:
+                buffers = _joined(buffers)
             try:
                 sent = stream.socket.sendmsg(buffers)
             except (BlockingIOError, InterruptedError):
