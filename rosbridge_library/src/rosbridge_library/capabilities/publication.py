@@ -14,6 +14,7 @@ from rospy.impl.registration import Registration
 from rosbridge_library.capability import OperationId
 from rosbridge_library.codec import MessageType, get_message_type
 from rosbridge_library.internal.exceptions import RosbridgeError
+from rosbridge_library.internal.ros_loader import canonical_type_name
 from rosbridge_library.names import checked_global_name
 from rosbridge_library.protocol import Protocol
 from rosbridge_library.ros.master import MasterUnreachable
@@ -68,9 +69,12 @@ class Publications:
         if not self.node.access.may_publish(name):
             raise AccessDenied(f"the server does not let clients publish {topic}")
         name = self.node.resolve(name)
-        info = await self._look_up(name, type_name, advertise_id)
-        type_ = await self._type(name, type_name, info)
-        self._may_still_open(name, type_)
+        info: Optional[TopicInfo] = None
+        type_ = self._type_of_ours(name, type_name, latch)
+        if type_ is None:
+            info = await self._look_up(name, type_name, advertise_id)
+            type_ = await self._type(name, type_name, info)
+            self._may_still_open(name, type_)
         publisher = self.node.publishers.open(
             name,
             type_,
@@ -95,6 +99,13 @@ class Publications:
         """The nodes that subscribe to a topic: this one too, from before the master knows of it."""
         ours = [] if self.node.feeds.get(name) is None else [self.node.caller_id]
         return ours if info is None else info.subscribers + ours
+
+    def _type_of_ours(self, name: str, type_name: Optional[str], latch: bool) -> Optional[MessageType]:
+        """The type of a publisher that is there and fits: a page that comes back waits for nobody."""
+        ours = self.node.publishers.get(name)
+        if ours is None or not (ours.users or ours.latch == latch):
+            return None
+        return ours.type if type_name is None or canonical_type_name(type_name, "msg") == ours.type.name else None
 
     def _may_still_open(self, name: str, type_: MessageType) -> None:
         """Raise for what has changed while the master was asked."""

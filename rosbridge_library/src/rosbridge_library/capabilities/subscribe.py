@@ -272,22 +272,24 @@ class Subscribe(Capability):
             self.protocol.log("error", f"subscribe: {reason}", message.get("id"))
 
     async def _confirm(self, stream: Stream, message: Operation) -> None:
-        troubles = await stream.feed.live()
-        if troubles and await self._reaches_all_publishers(stream.feed):
-            troubles = []  # the master also lists the old address of a node that died and was started again
+        begin_s = self.protocol.loop.time()
+        await stream.feed.live()
+        unreachable = await self._unreachable_publishers(stream.feed, begin_s)
         lid = message.get("id")
         if self._streams.get(stream.topic) is not stream or lid not in stream.wishes:
             return
-        for trouble in troubles:
+        for node, reason in unreachable.items():
+            trouble = f"{node}, which publishes {stream.topic}, can't be reached: {reason}"
             self.protocol.log("error", f"subscribe: {trouble}", lid)
         self.protocol.log("info", f"subscribe: {stream.topic} is subscribed to", lid)
 
-    async def _reaches_all_publishers(self, feed: Feed) -> bool:
+    async def _unreachable_publishers(self, feed: Feed, since_s: float) -> Dict[str, str]:
+        """By name: the master also lists the old address of a node that died and was started again."""
         try:
             info = await self.protocol.node.topic(feed.topic)
         except (MasterUnreachable, MasterError, RosTimeout):
-            return False
-        return set(info.publishers) <= {publication.node for publication in feed.publications}
+            return {}  # nobody knows, and what is connected goes on
+        return await feed.unreachable(info.publishers, since_s)
 
     @on_loop
     def unsubscribe(self, message: Operation) -> None:

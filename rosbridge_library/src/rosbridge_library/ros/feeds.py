@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from typing import TYPE_CHECKING, Callable, Dict, List, NamedTuple, Optional, Set, Tuple, Type
+from typing import TYPE_CHECKING, Callable, Dict, Iterable, List, NamedTuple, Optional, Set, Tuple, Type
 
 import genpy
 from rospy.impl.registration import Registration, get_topic_manager
@@ -68,8 +68,7 @@ class Feed(Receiver):
         self._latched: Dict[InboundConnection, Message] = {}
         self._refused: Dict[str, str] = {}  # publisher uri: why
         self._changed = asyncio.Event()
-        self._live: Optional[asyncio.Task[List[str]]] = None
-        self._was_live = False
+        self._live: Optional[asyncio.Task[None]] = None
         self.received_messages = 0
         self.received_bytes = 0
 
@@ -99,41 +98,44 @@ class Feed(Receiver):
         if not self._sinks:
             self._feeds.close(self)
 
-    async def live(self) -> List[str]:
-        """Wait until nothing that is published is missed; a sentence for each publisher that doesn't answer.
+    async def live(self) -> None:
+        """Wait until nothing that is published is missed, but by publishers that don't answer within LIVE_TIMEOUT_S.
 
-        While the master is away this waits for it.
+        While the master is away this waits for it. Raises MasterError when the master refuses the subscription.
         """
-        if self._live is None or self._live.done():
+        if self._live is None or self._live.cancelled() or (self._live.done() and self._live.exception()):
             self._live = self._feeds.loop.create_task(self._become_live())
-        return await asyncio.shield(self._live)
+        await asyncio.shield(self._live)
 
-    async def _become_live(self) -> List[str]:
-        settled = asyncio.wrap_future(self._feeds.registrar.settled(Registration.SUB, self.topic))
-        # Once live it stays so: later, the master is only asked whether publishers have come or died since.
-        await asyncio.wait({settled}, timeout=LIVE_TIMEOUT_S if self._was_live else None)
-        if not settled.done():
-            settled.cancel()
-            return [f"the master does not say who publishes {self.topic} now: {self._feeds.registrar.trouble}"]
-        publishers = set(settled.result())
-        deadline = self._feeds.loop.time() + LIVE_TIMEOUT_S
-        while True:
-            waiting = publishers - self._connected() - set(self._refused)
-            left_s = deadline - self._feeds.loop.time()
-            if not waiting or left_s <= 0:
-                break
-            self._changed.clear()
-            try:
-                await asyncio.wait_for(self._changed.wait(), left_s)
-            except asyncio.TimeoutError:
-                break
+    async def _become_live(self) -> None:
+        uris = await asyncio.wrap_future(self._feeds.registrar.settled(Registration.SUB, self.topic))
+        publishers = set(uris)
+        await self._wait_until(lambda: publishers <= self._connected() | set(self._refused), self._feeds.loop.time())
         if publishers:
             await asyncio.sleep(ADDED_BY_PUBLISHER_S)
-        self._was_live = True
-        return [
-            f"the publisher at {uri} of {self.topic} can't be reached: {self._refused.get(uri, 'it does not answer')}"
-            for uri in sorted(publishers - self._connected())
-        ]
+
+    async def unreachable(self, publishers: Iterable[str], since_s: float) -> Dict[str, str]:
+        """Which of these nodes, publishers of the topic, are not connected, and why not.
+
+        They have LIVE_TIMEOUT_S from `since_s`, a time of the loop.
+        """
+
+        def missing() -> Set[str]:
+            return set(publishers) - {publication.node for publication in self._publications.values()}
+
+        await self._wait_until(lambda: not missing(), since_s)
+        reason = "; ".join(sorted(set(self._refused.values()))) or "it does not answer"
+        return dict.fromkeys(sorted(missing()), reason)
+
+    async def _wait_until(self, condition: Callable[[], bool], since_s: float) -> None:
+        """Return when `condition` holds, which connections change, or LIVE_TIMEOUT_S are over."""
+        deadline = since_s + LIVE_TIMEOUT_S
+        while not condition():
+            self._changed.clear()
+            try:
+                await asyncio.wait_for(self._changed.wait(), deadline - self._feeds.loop.time())
+            except asyncio.TimeoutError:
+                return
 
     def _connected(self) -> Set[str]:
         return {connection.endpoint_id for connection in self._publications}
@@ -175,6 +177,7 @@ class Feed(Receiver):
     def disconnected(self, connection: InboundConnection) -> None:
         self._publications.pop(connection, None)
         self._latched.pop(connection, None)
+        self._refused.pop(connection.endpoint_id, None)
 
     def refused(self, connection: InboundConnection, reason: str) -> None:
         self._refused[connection.endpoint_id] = reason
