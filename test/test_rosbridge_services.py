@@ -220,6 +220,14 @@ def test_the_default_timeout(start_bridge, connect, peer: Peer):
     assert client.call_service(service, [1, 2])["result"] is False
     assert client.call_service(service, [1, 2], timeout=5)["values"] == {"sum": 3}
     assert client.call_service(service, [1, 2], timeout=0)["values"] == {"sum": 3}
+    provided = fresh("thoughtful")  # a client may think for longer than the server's own calls may take
+    client.advertise_service(provided, ADD)
+    client.sync()
+    call = peer.begin_call(provided, ADD, {"a": 1, "b": 2})
+    request = client.wait_for(op="call_service")
+    client.collect(0.5)
+    client.send({"op": "service_response", "id": request["id"], "values": {"sum": 3}, "result": True})
+    assert call.result() == {"sum": 3}
 
 
 def test_dozens_of_slow_calls_delay_nothing(client: Client, connect, bridge: Bridge, peer: Peer, add: str):

@@ -53,7 +53,8 @@ class Peer:
         self.subscribers[topic] = rospy.Subscriber(topic, cls, lambda message: messages.append(plain(message)))
 
     def publisher_count(self, topic: str) -> int:
-        return int(self.subscribers[topic].get_num_connections())
+        """How many have answered the handshake: rospy counts a connection from before it is made."""
+        return sum(connection.md5sum is not None for connection in self.subscribers[topic].impl.connections)
 
     def received(self, topic: str) -> List[Any]:
         return list(self.messages[topic])
