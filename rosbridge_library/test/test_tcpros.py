@@ -9,6 +9,7 @@ import struct
 from typing import Any, Awaitable, Callable, List, Optional
 
 import pytest
+
 from rosbridge_library.ros import tcpros
 from rosbridge_library.ros.feeds import _any_type, _FeedSubscriber
 from rosbridge_library.ros.tcpros import InboundConnection, LoopTcprosHandler, OutboundConnection, Receiver

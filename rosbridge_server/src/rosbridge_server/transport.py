@@ -51,10 +51,8 @@ class StreamTransport:
         if stream.closed():
             return True
         if self._plain and not stream.writing():
-            if len(buffers) > _MAX_BUFFERS:
-                buffers = _joined(buffers)
             try:
-                sent = stream.socket.sendmsg(buffers)
+                sent = stream.socket.sendmsg(buffers[:_MAX_BUFFERS])
             except (BlockingIOError, InterruptedError):
                 sent = 0
             except OSError as error:
