@@ -314,15 +314,15 @@ def test_unregister_timeout(start_bridge, connect, ros_master: RosMaster, peer: 
 
 def test_unregister_timeout_of_zero(start_bridge, connect, ros_master: RosMaster):
     bridge = start_bridge({"unregister_timeout": 0}, name="brief")
-    for leave in (
-        lambda client, topic: client.send({"op": "unadvertise", "topic": topic}),
-        lambda client, _: client.close(),
-    ):
+    for leaves in (False, True):
         topic, client = fresh("brief"), connect(bridge)
         client.advertise(topic, INT32)
         client.sync()
         assert ros_master.publishers(topic) == ["/brief"]
-        leave(client, topic)
+        if leaves:
+            client.close()
+        else:
+            client.send({"op": "unadvertise", "topic": topic})
         wait_until(lambda name=topic: ros_master.publishers(name) == [], 2.0)
 
 

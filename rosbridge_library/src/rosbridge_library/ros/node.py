@@ -121,7 +121,8 @@ class Node:
         """
         settled = asyncio.wrap_future(self._registrar.settled(kind, name))
         try:
-            await asyncio.wait_for(settled, MASTER_TIMEOUT_S)
+            # A master that is known to be away is hardly waited for.
+            await asyncio.wait_for(settled, MASTER_TIMEOUT_S if self._registrar.trouble is None else 1.0)
         except asyncio.TimeoutError:
             reason = self._registrar.trouble or f"the master did not register {name} within {MASTER_TIMEOUT_S:g} s"
             raise MasterUnreachable(reason) from None
