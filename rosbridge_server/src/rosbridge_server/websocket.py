@@ -9,6 +9,7 @@ exit code is 0 when it was told to end, 1 when it can't serve, 2 for a command l
 from __future__ import annotations
 
 import asyncio
+import gc
 import logging
 import os
 import resource
@@ -29,6 +30,8 @@ _NAME = "rosbridge_websocket"
 
 # How long each step of the end may take, in seconds; all together at most the last one.
 _CLIENTS_S, _ROS_S, _ALL_S = 0.5, 1.5, 2.5
+
+_GC_THRESHOLD = 20_000
 
 _ROS_MODULES = ("genpy", "rosgraph", "rosgraph_msgs", "roslib", "rospkg", "rospy", "std_msgs")
 _OWN_MODULES = ("rosbridge_library", "rosbridge_msgs", "rosbridge_server")
@@ -152,6 +155,10 @@ async def _start(settings: Settings, node: Node) -> WebSocketServer:
     from rosbridge_server.server import WebSocketServer
 
     await node.start()
+    # What is loaded by now stays, and JSON of large arrays of messages makes thousands of objects that die together:
+    # the collector would look for cycles among them all the time, and find none.
+    gc.freeze()
+    gc.set_threshold(_GC_THRESHOLD)
     clients = await node.call(Clients, node.now)
     server = WebSocketServer(
         settings,

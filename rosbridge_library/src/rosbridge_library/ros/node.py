@@ -38,6 +38,7 @@ logger = logging.getLogger("rosbridge.node")
 
 CALL_THREADS = 16
 MASTER_TIMEOUT_S = 5.0
+AWAY_AFTER_S = 1.2
 CALL_TIMEOUT_S = MASTER_TIMEOUT_S + 1.0
 """Longer, because what a call to the master says when its own time is over tells more."""
 DEFAULT_UNREGISTER_TIMEOUT_S = 10.0
@@ -121,8 +122,10 @@ class Node:
         """
         settled = asyncio.wrap_future(self._registrar.settled(kind, name))
         try:
-            # A master that is known to be away is hardly waited for.
-            await asyncio.wait_for(settled, MASTER_TIMEOUT_S if self._registrar.trouble is None else 1.0)
+            await asyncio.wait({settled}, timeout=AWAY_AFTER_S)
+            # A master that is known to be away by now is not waited for.
+            left_s = MASTER_TIMEOUT_S - AWAY_AFTER_S if self._registrar.trouble is None else 0
+            await asyncio.wait_for(settled, left_s)
         except asyncio.TimeoutError:
             reason = self._registrar.trouble or f"the master did not register {name} within {MASTER_TIMEOUT_S:g} s"
             raise MasterUnreachable(reason) from None
