@@ -16,7 +16,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rosbridge_library.codec import get_message_type, message_type_from_definition
+from rosbridge_library.codec import encode_json, get_message_type, message_type_from_definition
 from rosbridge_library.encodings import (
     BSON_IF_BINARY,
     TOPIC_ENCODINGS,
@@ -180,3 +180,10 @@ def test_a_message_is_encoded_once_for_all_who_ask_for_the_same() -> None:
 
     assert one.encoded(("none", "t"), encode) is one.encoded(("none", "t"), encode)
     assert made == ["once"]
+
+
+def test_a_tiny_fragment_size_makes_a_bounded_number_of_fragments() -> None:
+    text = encode_json({"op": "status", "msg": "x" * 1_000_000})
+    parts = [json.loads(part.data) for part in in_fragments(Payload([text]), 1)]
+    assert 9_000 < len(parts) <= 10_000
+    assert "".join(part["data"] for part in parts) == text.decode()

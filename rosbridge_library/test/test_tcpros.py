@@ -265,3 +265,11 @@ def test_a_subscriber_that_leaves_is_noticed() -> None:
         assert connection.done
 
     outbound(check)
+
+
+def test_rospy_may_publish_from_a_thread_of_its_own() -> None:
+    async def check(connection: OutboundConnection, subscriber: socket.socket) -> None:
+        await asyncio.get_running_loop().run_in_executor(None, connection.write_data, frame(b"from a thread"))
+        assert await _read_frame(subscriber) == b"from a thread"
+
+    outbound(check)

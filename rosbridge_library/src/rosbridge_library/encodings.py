@@ -24,6 +24,7 @@ from rosbridge_library.internal.exceptions import DecodeError, RosbridgeError
 from rosbridge_library.payload import Buffer, Payload
 from rosbridge_library.ros.message import Message
 
+MAX_FRAGMENTS = 10_000
 MAX_PIECES = 16
 MAX_PNG_BYTES = 256 * 1024 * 1024
 """What a client's PNG may decode to: a small image can hold a great many zeros."""
@@ -219,13 +220,15 @@ def _check_png(image: bytes) -> None:
 def in_fragments(payload: Payload, fragment_size: Optional[int]) -> List[Payload]:
     """The payload itself or, when its text is longer than `fragment_size` characters, fragment operations of it.
 
-    Binary payloads can't be fragmented: a fragment holds text.
+    Binary payloads can't be fragmented: a fragment holds text. A message makes at most `MAX_FRAGMENTS` of them, larger
+    ones than asked if need be: a great many would hold up everybody.
     """
     if fragment_size is None or payload.binary or payload.size <= fragment_size:
         return [payload]
     text = payload.data.decode("utf-8")
     if len(text) <= fragment_size:
         return [payload]
+    fragment_size = max(fragment_size, math.ceil(len(text) / MAX_FRAGMENTS))
     return [_json_operation(part) for part in fragments(text, fragment_size, str(next(_fragment_ids)))]
 
 

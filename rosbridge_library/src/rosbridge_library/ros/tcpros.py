@@ -119,10 +119,6 @@ class _LoopTransport(TCPROSTransport):  # type: ignore[misc]
     def fileno(self) -> None:
         """None: rospy must not poll a socket that the loop watches."""
 
-    def write_data(self, data: bytes) -> bool:
-        """rospy's own publish never reaches these connections."""
-        raise NotImplementedError
-
     def close(self) -> None:
         """End the connection, from any thread."""
         if self.done:
@@ -473,6 +469,11 @@ class OutboundConnection(_LoopTransport):
         self.loop.add_reader(self.socket, self._readable)
         self._transmit(encode_header(self.protocol.get_header_fields()))
         attach(self)
+
+    def write_data(self, data: bytes) -> bool:
+        """Send a frame of rospy's, from any thread: a program that embeds the library publishes the topic too."""
+        self.loop.call_soon_threadsafe(self.send, data)
+        return True
 
     def send(self, frame: bytes) -> None:
         """Send one message with its length in front, or queue it."""
