@@ -233,7 +233,7 @@ class Subscribe(Capability):
         return None
 
     async def _open(self, name: str, type_name: Optional[str], wishes: Wishes, message: Operation) -> None:
-        present = await self._present_type(name, message)
+        present = await self._present_type(name, type_name, message)
         if type_name is not None and present not in ("", type_name):
             raise TopicConflict(f"{name} has type {present}, not {type_name}")
         if not present:
@@ -247,13 +247,16 @@ class Subscribe(Capability):
         feed.add(stream)
         self.protocol.spawn(self._confirm(stream, message), message)
 
-    async def _present_type(self, name: str, message: Operation) -> str:
+    async def _present_type(self, name: str, type_name: Optional[str], message: Operation) -> str:
         """The type that the topic has now; "" when it has none, or, with the client told, the master is away."""
         feed = self.protocol.node.feeds.get(name)
         if feed is not None and feed.type is not None:
             return feed.type.name
         try:
-            info: TopicInfo = await self.protocol.node.topic(name)
+            # A page subscribes to many topics at once: what the master said just now will do, unless it is bad news.
+            info: TopicInfo = await self.protocol.node.topic(name, max_age_s=1.0)
+            if not info.type or type_name not in (None, info.type):
+                info = await self.protocol.node.topic(name)
         except (MasterUnreachable, MasterError, RosTimeout) as error:
             self.protocol.log("error", f"subscribe: {error}; {name} follows when it is back", message.get("id"))
             return ""
@@ -285,6 +288,8 @@ class Subscribe(Capability):
 
     async def _unreachable_publishers(self, feed: Feed, since_s: float) -> Dict[str, str]:
         """By name: the master also lists the old address of a node that died and was started again."""
+        if feed.complete:
+            return {}
         try:
             info = await self.protocol.node.topic(feed.topic)
         except (MasterUnreachable, MasterError, RosTimeout):

@@ -67,6 +67,7 @@ class Feed(Receiver):
         self._publications: Dict[InboundConnection, Publication] = {}
         self._latched: Dict[InboundConnection, Message] = {}
         self._refused: Dict[str, str] = {}  # publisher uri: why
+        self._uris: List[str] = []  # of the publishers that the master named
         self._changed = asyncio.Event()
         self._live: Optional[asyncio.Task[None]] = None
         self.received_messages = 0
@@ -109,10 +110,16 @@ class Feed(Receiver):
 
     async def _become_live(self) -> None:
         uris = await asyncio.wrap_future(self._feeds.registrar.settled(Registration.SUB, self.topic))
+        self._uris = uris
         publishers = set(uris)
         await self._wait_until(lambda: publishers <= self._connected() | set(self._refused), self._feeds.loop.time())
         if publishers:
             await asyncio.sleep(ADDED_BY_PUBLISHER_S)
+
+    @property
+    def complete(self) -> bool:
+        """Whether every publisher that the master named is connected."""
+        return set(self._uris) <= self._connected()
 
     async def unreachable(self, publishers: Iterable[str], since_s: float) -> Dict[str, str]:
         """Which of these nodes, publishers of the topic, are not connected, and why not.

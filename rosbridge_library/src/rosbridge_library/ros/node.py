@@ -79,6 +79,8 @@ class Node:
         self.services = ServiceCaller(self.call, self.master, self.caller_id)
         self.providers = ServiceProviders(self.call, self.master, self.caller_id)
         self._topic_lookup: Optional[asyncio.Task[_Graph]] = None
+        self._graph: Optional[_Graph] = None
+        self._graph_time_s = 0.0
 
     async def start(self) -> None:
         """Take rospy's place at the topic sockets and at the master. Raises RuntimeError before rospy.init_node."""
@@ -141,12 +143,16 @@ class Node:
         resolved: str = rospy.names.resolve_name(global_name)
         return resolved
 
-    async def topic(self, topic: str) -> TopicInfo:
-        """What the master knows of `topic`, asked after this call. Raises MasterUnreachable or MasterError.
+    async def topic(self, topic: str, max_age_s: float = 0.0) -> TopicInfo:
+        """What the master knows of `topic`, asked after this call, or at most `max_age_s` before it.
+
+        Raises MasterUnreachable or MasterError.
 
         The master remembers the types of topics that are gone, so a topic that nobody publishes or subscribes has no
         type here.
         """
+        if self._graph is not None and self.loop.time() - self._graph_time_s < max_age_s:
+            return self._graph.topic(topic)
         # One look serves all who asked before it began.
         lookup = self._topic_lookup
         if lookup is None:
@@ -157,7 +163,10 @@ class Node:
     async def _look_up_topics(self) -> _Graph:
         await asyncio.sleep(0)  # whoever asks in this turn of the loop is served too
         self._topic_lookup = None
-        return await self.call(self._ask_graph, timeout=2 * MASTER_TIMEOUT_S + 1)
+        time_s = self.loop.time()
+        graph = await self.call(self._ask_graph, timeout=2 * MASTER_TIMEOUT_S + 1)
+        self._graph, self._graph_time_s = graph, time_s
+        return graph
 
     def _ask_graph(self) -> _Graph:
         publishers, subscribers, _ = self.master.call("getSystemState")
