@@ -101,6 +101,8 @@ export async function latch(page, { name }) {
   topic.advertise();
   topic.publish(page.message({ data: 'first' }));
   topic.publish(page.message({ data: 'last' }));
+  // Connections don't wait for each other; on one connection everything is in order.
+  await collect(new page.roslib.Topic({ ros, ...options }), 1);
   const [late] = await collect(new page.roslib.Topic({ ros: other, ...options }), 1);
   page.say({ published: late.data });
   await page.told();
