@@ -284,6 +284,11 @@ class Protocol:
             status = {"op": "status", "level": level, "msg": message}
             self.send(status if lid is None else {**status, "id": lid})
 
+    def dropped(self, messages: Mapping[str, int]) -> None:
+        """Tell the client that so many messages of these topics were dropped, since it is slow."""
+        topics = ", ".join(f"{count} of {topic}" for topic, count in sorted(messages.items()))
+        self.log("warning", f"the connection is too slow for all that is subscribed to; dropped messages: {topics}")
+
     def _set_level(self, message: Operation) -> None:
         level, lid = message.get("level"), checked_id(message)
         if not isinstance(level, str) or level not in STATUS_LEVELS:
