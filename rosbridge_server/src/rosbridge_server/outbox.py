@@ -28,9 +28,9 @@ from rosbridge_library.payload import Buffer, Payload, Source
 
 logger = logging.getLogger("rosbridge.outbox")
 
-_QUANTUM_BYTES = 65536
+_QUANTUM_BYTES = 16384
 """What a source may send in one turn, on average."""
-_BATCH_BYTES = 65536
+_BATCH_BYTES = 32768
 _BATCH_BUFFERS = 256
 """A write to the transport is closed when it holds this much: so it never has more than one large message."""
 _TELL_INTERVAL_S = 1.0
