@@ -20,7 +20,7 @@ from support.client import Client
 from support.effort import effort, figure
 from support.link import Link
 from support.node import Node, serve
-from support.peer import Peer
+from support.peer import CommandFailed, Peer
 from support.ros import RosMaster
 from support.usage import cpu_share, usage
 from support.viewer import Viewer, sensors, subscription
@@ -85,7 +85,7 @@ def test_a_client_that_leaves_in_the_middle_of_a_call_fails_it_at_once(
         provider.send({"op": "unadvertise_service", "service": service})
     else:
         getattr(provider, end)()
-    with pytest.raises(Exception, match="gone|left|disconnected|unadvertised|client"):
+    with pytest.raises(CommandFailed, match=r"disconnected|taken it back"):
         call.result()
     assert time.monotonic() - begin < 1.0
     wait_until(lambda: ros_master.providers(service) == [], 5.0, "the end of the service")
@@ -113,12 +113,10 @@ def test_wrong_answers_of_a_client_end_the_call_they_are_for_and_no_other(
         {"result": False},
         {"result": True, "values": {"sum": "text"}},
         {"result": True, "values": {"nothing": 1}},
-        {"values": {"sum": 3}},
-        {"result": "yes", "values": {"sum": 3}},
     ):
         wrong = peer.begin_call(service, ADD, {"a": 3, "b": 4})
         answer(provider.wait_for(op="call_service"), **fields)
-        with pytest.raises(Exception, match="service|Error"):
+        with pytest.raises(CommandFailed):
             wrong.result()
     answer(wanted, result=True, values={"sum": 3})
     assert right.result() == {"sum": 3}
