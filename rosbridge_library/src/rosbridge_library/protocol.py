@@ -278,7 +278,7 @@ class Protocol:
         """Log `message`, and send it to the client when it asked for `level`; `lid` is the id of what caused it."""
         if len(message) > MAX_STATUS_LENGTH:
             message = message[:MAX_STATUS_LENGTH] + "…"  # it quotes what the client sent, which may be megabytes
-        about = f" [id: {lid}]" if lid is not None else ""
+        about = f" [id: {str(lid)[:100]}]" if lid is not None else ""
         logger.log(_LOGGING_LEVELS[level], "[client %s]%s %s", self.client_id, about, message)
         if STATUS_LEVELS[level] <= STATUS_LEVELS[self.status_level]:
             status = {"op": "status", "level": level, "msg": message}
