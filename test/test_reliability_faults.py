@@ -170,7 +170,6 @@ def test_a_master_that_is_killed_and_restarted_three_times_under_load(
     nodes(sensors(ros_master, image_bytes=100_000))
     bridge = start_bridge(name="enduring")
     topic = fresh("enduring")
-    before = 0
     with Viewer(ros_master, bridge.port, [IMAGE, STATE], connections=2) as viewer, bridge.connect() as client:
         viewer.sees("/image", "/state")
         client.advertise(topic, INT32)
@@ -196,9 +195,6 @@ def test_a_master_that_is_killed_and_restarted_three_times_under_load(
                     lambda found=found: "/enduring" in found(), 8.0, lambda: str(ros_master.call("getSystemState"))
                 )
             figure(f"master restart {round_ + 1}", registered_again_after_s=time.monotonic() - begin)
-            took = usage(bridge.process.pid)
-            assert took.threads <= before or not before, "each restart leaves a thread behind"
-            before = before or took.threads + 2
         newcomer = Peer(ros_master, "newcomer")
         nodes(newcomer.node)
         newcomer.subscribe(topic, INT32)

@@ -59,7 +59,7 @@ def rounds(bridge: Bridge, name: str, play: Callable[[Random], int]) -> None:
     after = usage(bridge.process.pid)
     figure(f"fuzz {name}", inputs=inputs, seeds=seed - FIRST_SEED, rss_mib_before=before.rss_mib, rss_mib=after.rss_mib)
     assert after.rss_mib < before.rss_mib + 60 + SECONDS / 10, f"seeds {FIRST_SEED} to {seed}"
-    wait_until(lambda: usage(bridge.process.pid).threads <= before.threads + 18, 15.0, "threads ended")
+    wait_until(lambda: usage(bridge.process.pid).threads <= before.threads + 22, 15.0, "threads ended")
 
 
 ALLOWED = ["publishes what can't be understood"]
