@@ -197,7 +197,7 @@ def plot(samples: List[Sample], path: Path) -> None:
     minutes = [sample.minute for sample in samples]
     memory.plot(minutes, [sample.rss_mib for sample in samples])
     memory.set_ylabel("RSS, MiB")
-    memory.set_ylim(bottom=0)
+    memory.set_ylim(0, 1.2 * max(sample.rss_mib for sample in samples))
     processor.plot(minutes, [sample.cpu_percent for sample in samples], linewidth=0.6)
     processor.set_ylabel("CPU, % of one")
     processor.set_ylim(bottom=0)
