@@ -31,6 +31,8 @@ IMAGE, STATE, MAP = subscription("/image", "cbor-raw"), subscription("/state"), 
 HEALTHY = 7
 PINGS: Dict[str, float] = {"websocket_ping_interval": 1.0, "websocket_ping_timeout": 2.0}
 
+pytestmark = pytest.mark.alone
+
 Nodes = Callable[[Node], Node]
 Start = Callable[..., Bridge]
 

@@ -195,6 +195,23 @@ def test_a_length_that_nothing_follows_costs_no_memory() -> None:
     run(serve, check)
 
 
+def test_a_length_that_there_is_no_memory_for_ends_the_connection_only() -> None:
+    async def serve(writer: asyncio.StreamWriter) -> None:
+        writer.write(encode_header(HEADER) + frame(b"good") + struct.pack("<I", 1 << 30) + b"a little of it")
+
+    async def check(record: Record) -> None:
+        await record.until(lambda: "disconnected" in record.events)
+        assert record.messages == [b"good"]
+
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    virtual_bytes = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (virtual_bytes + (1 << 28), before[1]))
+    try:
+        run(serve, check)
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+
+
 @pytest.mark.parametrize("of", ["feeds", "publishers"])
 def test_a_topic_that_ends_leaves_no_file_open_until_the_garbage_is_collected(of: str) -> None:
     """rospy's topics hold a poller that holds itself."""

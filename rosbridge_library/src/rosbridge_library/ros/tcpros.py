@@ -225,6 +225,7 @@ class InboundConnection(_LoopTransport):
             self._task.cancel()
         if self._calls is not None:
             self._calls.close()
+        self._large = None
         super()._close_on_loop()
 
     async def _run(self) -> None:
@@ -377,8 +378,13 @@ class InboundConnection(_LoopTransport):
                     self._lose(f"corrupt: a message of {length} bytes")
                     return
                 if 4 + length > len(buffer):
-                    # Its pages are taken as it is filled: a length alone, which may be a lie, costs nothing.
-                    self._large = np.empty(length, np.uint8).data
+                    try:
+                        # Its pages are taken as it is filled: a length alone, which may be a lie, costs nothing.
+                        self._large = np.empty(length, np.uint8).data
+                    except MemoryError:
+                        self._buffered = 0
+                        self._lose(f"there is no memory for a message of {length} bytes")
+                        return
                     self._large_read = end - at - 4
                     self._large[: self._large_read] = buffer[at + 4 : end]
                     at = end
