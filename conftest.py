@@ -41,6 +41,7 @@ from support.ros import RosMaster  # noqa: E402
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line("markers", "alone: measures delays, which other tests at the same time would add to")
     config.addinivalue_line(
         "markers", "allow_log(*patterns): regular expressions of errors that the server may log in this test"
     )

@@ -687,6 +687,17 @@ def test_a_message_that_does_not_conform_is_dropped_with_an_error(bridge: Bridge
     assert peer.received(topic, 1) == [{"data": 42}]
 
 
+def test_a_topic_that_the_bridge_itself_publishes_is_there_at_once(start_bridge, connect, peer: Peer):
+    client = connect(start_bridge(name="speaking"))
+    peer.subscribe("/rosout", "rosgraph_msgs/Log")
+    begin = time.monotonic()
+    client.publish("/rosout", {"level": 2, "name": "/page", "msg": "from a client"})
+    client.sync()
+    assert time.monotonic() - begin < 2.0
+    wait_until(lambda: any(log["msg"] == "from a client" for log in peer.received("/rosout")))
+    assert client.statuses("error") == []
+
+
 def test_publishing_on_a_topic_that_does_not_exist_is_an_error(bridge: Bridge, connect, ros_master: RosMaster):
     client, topic = connect(bridge), fresh()
     number = client.publish(topic, {"data": 1})

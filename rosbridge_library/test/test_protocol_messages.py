@@ -355,3 +355,13 @@ def test_a_capability_that_fails_to_finish_does_not_keep_others_from_it(caplog: 
         assert "in finish" in caplog.text
 
     run(check)
+
+
+def test_a_long_id_comes_back_whole_but_does_not_fill_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    def check(protocol: Recorder) -> None:
+        protocol.incoming(json.dumps({"op": "set_level", "level": 7, "id": "x" * 100_000}))
+        assert protocol.sent[0]["id"] == "x" * 100_000
+
+    run(check)
+    assert "set_level" in caplog.text
+    assert len(caplog.text) < 2000

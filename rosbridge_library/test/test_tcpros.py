@@ -4,14 +4,19 @@
 from __future__ import annotations
 
 import asyncio
+import gc
+import os
+import resource
 import socket
 import struct
+from pathlib import Path
 from typing import Any, Awaitable, Callable, List, Optional
 
 import pytest
 
 from rosbridge_library.ros import tcpros
 from rosbridge_library.ros.feeds import _any_type, _FeedSubscriber
+from rosbridge_library.ros.publishers import _LoopPublisher
 from rosbridge_library.ros.tcpros import InboundConnection, LoopTcprosHandler, OutboundConnection, Receiver
 from rosbridge_library.ros.tcpros_header import encode_header
 
@@ -158,7 +163,8 @@ def test_a_corrupt_length_ends_the_connection_only() -> None:
     [
         (encode_header({"error": "not for you"}), "not for you"),
         (encode_header({"callerid": "/talker"}), "md5sum"),
-        (struct.pack("<I", 0xFFFFFFFF), "corrupt"),
+        (struct.pack("<I", 0xFFFFFFFF), "a connection header of 4294967295 bytes"),
+        (struct.pack("<I", 200 * 1024 * 1024) + bytes(1000), "a connection header of 209715200 bytes"),
         (struct.pack("<I", 6) + struct.pack("<I", 99) + b"ab", ""),
     ],
 )
@@ -172,6 +178,57 @@ def test_a_bad_answer_is_refused_with_its_reason(answer: bytes, reason: str) -> 
         assert reason in record.events[0]
 
     run(serve, check)
+
+
+def test_a_length_that_nothing_follows_costs_no_memory() -> None:
+    def resident_mib() -> float:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() / (1 << 20)
+
+    async def serve(writer: asyncio.StreamWriter) -> None:
+        writer.write(encode_header(HEADER) + frame(b"good") + struct.pack("<I", 1 << 30) + b"a little of it")
+
+    async def check(record: Record) -> None:
+        await record.until(lambda: bool(record.messages))
+        assert resident_mib() < before + 50
+
+    before = resident_mib()
+    run(serve, check)
+
+
+def test_a_length_that_there_is_no_memory_for_ends_the_connection_only() -> None:
+    async def serve(writer: asyncio.StreamWriter) -> None:
+        writer.write(encode_header(HEADER) + frame(b"good") + struct.pack("<I", 1 << 30) + b"a little of it")
+
+    async def check(record: Record) -> None:
+        await record.until(lambda: "disconnected" in record.events)
+        assert record.messages == [b"good"]
+
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    virtual_bytes = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (virtual_bytes + (1 << 28), before[1]))
+    try:
+        run(serve, check)
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+@pytest.mark.parametrize("of", ["feeds", "publishers"])
+def test_a_topic_that_ends_leaves_no_file_open_until_the_garbage_is_collected(of: str) -> None:
+    """rospy's topics hold a poller that holds itself."""
+    gc.collect()
+    gc.disable()
+    try:
+        before = len(os.listdir("/proc/self/fd"))
+        for number in range(50):
+            if of == "feeds":
+                topic: Any = _FeedSubscriber(f"/t{number}", _any_type("*"))
+            else:
+                topic = _LoopPublisher(f"/t{number}", _any_type("*"))
+            topic.close()
+            del topic
+        assert len(os.listdir("/proc/self/fd")) <= before + 1
+    finally:
+        gc.enable()
 
 
 def test_a_publisher_that_never_answers_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:

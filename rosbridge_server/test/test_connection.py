@@ -47,6 +47,9 @@ class Echo:
         self.outbox.send(Payload([message], binary=message[:1] == b"\xa0"))
         return None
 
+    def dropped(self, messages: Mapping[str, int]) -> None:
+        """Nothing is dropped here that a test asks for."""
+
     def finish(self) -> None:
         self.finished += 1
 
@@ -88,12 +91,26 @@ class Running:
 
     async def raw(self, **headers: str) -> Tuple[asyncio.StreamReader, asyncio.StreamWriter]:
         """A connection after its handshake, for a client that breaks the rules."""
-        reader, writer = await asyncio.open_connection("127.0.0.1", self.server.port)
+        return await self.raw_over(socket.create_connection(("127.0.0.1", self.server.port)), **headers)
+
+    async def raw_over(
+        self, connected: socket.socket, limit: int = 65536, **headers: str
+    ) -> Tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        """The same over a connected socket; `limit`: how much is read ahead, about."""
+        reader, writer = await asyncio.open_connection(sock=connected, limit=limit)
         writer.write(handshake(**headers))
         assert b" 101 " in await reader.readline()
         while await reader.readline() != b"\r\n":
             pass
         return reader, writer
+
+
+def small_window_socket(port: int) -> socket.socket:
+    """A connection whose kernel takes little that nobody reads."""
+    connected = socket.socket()
+    connected.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 8192)
+    connected.connect(("127.0.0.1", port))
+    return connected
 
 
 def handshake(path: str = "/", **headers: str) -> bytes:
@@ -635,6 +652,37 @@ def test_a_client_that_never_reads_its_responses_is_closed(caplog: pytest.LogCap
             await until(lambda: echo.finished)
             assert "since it does not read" in caplog.text
             writer.close()
+
+    asyncio.run(run())
+
+
+def test_a_client_that_takes_nothing_is_closed_and_one_that_takes_little_is_not(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    """Both have a ping waiting behind a large message, which neither can answer."""
+
+    async def run() -> None:
+        timeouts = {"websocket_ping_interval": 0.1, "websocket_ping_timeout": 0.2, "stall_timeout": 1.0}
+        async with serving(**timeouts) as running:
+            slow_socket = small_window_socket(running.server.port)
+            slow_reader, slow_writer = await running.raw_over(slow_socket, limit=4096)
+            slow = running.last
+            _, stopped_writer = await running.raw_over(small_window_socket(running.server.port), limit=4096)
+            stopped = running.last
+            for each in (slow, stopped):
+                each.outbox.send(Payload([bytes(4 * MIB)], binary=True))
+            begin = time.monotonic()
+            while not stopped.finished:  # about 1 MB/s
+                await slow_reader.readexactly(4096)
+                await asyncio.sleep(0.004)
+                assert time.monotonic() - begin < 10, "still there"
+            assert 1.0 <= time.monotonic() - begin < 3.0
+            assert slow.finished == 0
+            assert (
+                f"Client {stopped.client_id} is closed, since it does not read: it took nothing for 1 s" in caplog.text
+            )
+            slow_writer.close()
+            stopped_writer.close()
 
     asyncio.run(run())
 

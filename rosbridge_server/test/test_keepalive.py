@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from typing import List
+from typing import Callable, List
 
 import pytest
 
@@ -47,17 +47,22 @@ class _Loop:
 
 
 class _Case:
-    def __init__(self, interval: float, timeout: float) -> None:
+    def __init__(self, interval: float, timeout: float, sent_after: float = 0.0) -> None:
         self.loop = _Loop()
+        self.sent_after = sent_after
         self.pings: List[float] = []
         self.lost: List[float] = []
         self.keepalive = KeepAlive(
             self.loop,  # type: ignore[arg-type]
             interval,
             timeout,
-            lambda: self.pings.append(self.loop.now),
+            self.ping,
             lambda: self.lost.append(self.loop.now),
         )
+
+    def ping(self, sent: Callable[[], None]) -> None:
+        self.pings.append(self.loop.now)
+        self.loop.call_later(self.sent_after, sent)
 
 
 @pytest.mark.parametrize(("interval", "timeout"), [(20, 30), (20, 5), (20, 20)])
@@ -96,6 +101,23 @@ def test_off() -> None:
     case.loop.advance_to(200)
     assert case.pings == list(range(20, 201, 20))
     assert case.lost == []
+
+
+def test_the_timeout_begins_when_the_ping_has_gone_out_and_there_is_one_ping_at_a_time() -> None:
+    """Behind a large message on a slow link it takes its time."""
+    case = _Case(20, 30, sent_after=70)
+    case.loop.advance_to(1000)
+    assert case.pings == [20, 100]
+    assert case.lost == [120]
+
+
+def test_a_ping_that_goes_out_after_the_end_starts_nothing() -> None:
+    case = _Case(20, 30, sent_after=70)
+    case.loop.advance_to(30)
+    case.keepalive.stop()
+    case.loop.advance_to(1000)
+    assert case.lost == []
+    assert case.loop.pending == 0
 
 
 def test_stop_leaves_no_timer() -> None:

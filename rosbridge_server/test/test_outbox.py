@@ -62,7 +62,8 @@ class Link:
         self.unsent = 0.0
         self.sent: List[bytes] = []
         self.writes: List[List[bytes]] = []
-        self.overflows: List[str] = []
+        self.given_up: List[str] = []
+        self.taken_bytes = 0.0
         self.outbox: Optional[ClientOutbox] = None
 
     def frame(self, payload: Payload) -> Tuple[Buffer, ...]:
@@ -74,14 +75,15 @@ class Link:
         self.writes.append(written)
         self.sent += written
         size = sum(map(len, written))
+        self.taken_bytes += min(size, self.room)
         if size <= self.room:
             self.room -= size
             return True
         self.unsent, self.room = size - self.room, 0
         return False
 
-    def overflow(self, reason: str) -> None:
-        self.overflows.append(reason)
+    def give_up(self, reason: str) -> None:
+        self.given_up.append(reason)
 
     def carry(self, size: float) -> None:
         """Lets so many bytes go out."""
@@ -90,6 +92,7 @@ class Link:
             if self.unsent:
                 gone = min(self.unsent, size)
                 self.unsent -= gone
+                self.taken_bytes += gone
                 size -= gone
                 if not self.unsent:
                     self.room = 0
@@ -277,14 +280,14 @@ def test_a_client_that_reads_no_responses_is_given_up() -> None:
     outbox, link, _ = make(room=0, max_bytes=1000)
     send(outbox, b"-")
     send(outbox, b"x" * 5000)  # one may be as large as it likes
-    assert link.overflows == []
+    assert link.given_up == []
     send(outbox, b"x")
-    assert link.overflows == ["5000 bytes of responses wait for it"]
+    assert link.given_up == ["5000 bytes of responses wait for it"]
     assert outbox.waiting_bytes == 0
     put(outbox, Topic("/a"), b"x")
     send(outbox, b"x")
     assert outbox.waiting_bytes == 0
-    assert len(link.overflows) == 1
+    assert len(link.given_up) == 1
 
 
 def test_at_most_one_large_message_is_with_the_transport() -> None:
@@ -398,7 +401,103 @@ def test_delay_between_messages_paces_everything_and_blocks_nothing() -> None:
     assert link.take() == [b"c3"], "the first one after a pause need not wait"
 
 
+def test_a_client_that_takes_nothing_is_given_up() -> None:
+    outbox, link, clock = make(room=0, stall_timeout=8)
+    put(outbox, Topic("/a"), b"x" * 500)
+    send(outbox, b"y" * 100)
+    clock.advance(7.9)
+    assert link.given_up == []
+    clock.advance(2.2)
+    assert link.given_up == ["it took nothing for 8 s, and 100 bytes wait for it"]
+    assert clock.pending == 0
+    assert outbox.waiting_bytes == 0
+    put(outbox, Topic("/a"), b"x")
+    assert len(link.writes) == 1, "written to after the end"
+
+
+def test_a_client_that_takes_a_little_is_kept() -> None:
+    outbox, link, clock = make(room=0, stall_timeout=8)
+    put(outbox, Topic("/a"), b"x" * 500)
+    for _ in range(100):
+        clock.advance(7.9)
+        link.carry(1)
+    assert link.given_up == []
+    assert clock.pending == 1
+    link.carry(1000)
+    clock.advance(8)
+    assert clock.pending == 0, "a timer runs with nothing to send"
+    clock.advance(1000)
+    assert link.given_up == []
+
+
+def test_a_client_that_stalls_again_and_again_has_its_time_each_time() -> None:
+    outbox, link, clock = make(room=0, stall_timeout=8)
+    for _ in range(50):
+        put(outbox, Topic("/a"), b"x" * 500)
+        clock.advance(7)
+        link.carry(500)
+    assert link.given_up == []
+
+
+def test_without_a_stall_timeout_nobody_is_given_up_and_no_timer_runs() -> None:
+    outbox, link, clock = make(room=0)
+    put(outbox, Topic("/a"), b"x" * 500)
+    assert clock.pending == 0
+    clock.advance(10**6)
+    assert link.given_up == []
+
+
+def test_what_is_dropped_is_told_at_most_once_a_second_and_all_of_it() -> None:
+    outbox, _, clock = make(room=0, burst_bytes=1000)
+    told: List[Tuple[float, Dict[str, int]]] = []
+    outbox.on_dropped = lambda dropped: told.append((clock.now, dict(dropped)))
+    a, b = Topic("/a"), Topic("/b")
+    put(outbox, a, b"-")
+    for step in range(350):
+        clock.advance(0.01)
+        put(outbox, a, b"x" * 600)
+        if 110 <= step < 150:
+            put(outbox, b, b"y" * 600)
+    clock.advance(10)
+    assert [now for now, _ in told] == pytest.approx([told[0][0] + second for second in range(len(told))])
+    assert len(told) in (4, 5)
+    assert [sorted(dropped) for _, dropped in told if "/b" in dropped] == [["/a", "/b"]]
+    assert {topic: sum(dropped.get(topic, 0) for _, dropped in told) for topic in ("/a", "/b")} == outbox.dropped
+    assert clock.pending == 0
+
+
+def test_drops_are_not_told_to_a_client_that_has_not_taken_what_it_was_told_before() -> None:
+    outbox, link, clock = make(room=0, burst_bytes=1000)
+    told: List[Dict[str, int]] = []
+
+    def tell(dropped: Any) -> None:
+        told.append(dict(dropped))
+        send(outbox, b"status")
+
+    outbox.on_dropped = tell
+    put(outbox, Topic("/a"), b"-")
+    a = Topic("/a")
+    for _ in range(1000):
+        put(outbox, a, b"x" * 600)
+        clock.advance(0.1)
+    assert len(told) == 1
+    link.carry(10**6)
+    clock.advance(1)
+    assert len(told) == 2
+    assert sum(dropped["/a"] for dropped in told) == outbox.dropped["/a"]
+
+
 def test_no_timer_outlives_a_closed_outbox() -> None:
+    outbox, link, clock = make(delay_between_messages=0.5, stall_timeout=5, burst_bytes=0)
+    outbox.on_dropped = lambda dropped: None
+    link.room = 1
+    put(outbox, Topic("/a"), b"2")
+    a = Topic("/a")
+    for _ in range(3):
+        put(outbox, a, b"3")
+    link.take()
+    outbox.close()
+    assert clock.pending == 0
     outbox, link, clock = make(delay_between_messages=0.5)
     send(outbox, b"1")
     send(outbox, b"2")
@@ -471,6 +570,6 @@ def test_the_bytes_that_wait_are_counted_right_in_every_order() -> None:
         else:
             link.carry((state >> 12) % 2000)
         assert 0 <= outbox.waiting_bytes <= 20000 + 3000
-    assert link.overflows == []
+    assert link.given_up == []
     link.carry(float(10**7))
     assert outbox.waiting_bytes == 0

@@ -4,12 +4,15 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import Any, List
+from xml.etree import ElementTree
 
 import pytest
 
 from rosbridge_server.settings import Settings, SettingsError, help_text, load, read_flags
 
+LAUNCH_FILE = Path(__file__).resolve().parents[1] / "launch" / "rosbridge_websocket.launch"
 NAMES = [field.name for field in dataclasses.fields(Settings)]
 
 # For each setting: a value other than the default as text, and what it means.
@@ -39,6 +42,7 @@ TEXTS = {
     "max_incoming_size": ("0", 0),
     "burst_bytes": ("65536", 65536),
     "max_client_bytes": ("1000000", 1000000),
+    "stall_timeout": ("12.5", 12.5),
 }
 
 
@@ -54,6 +58,16 @@ def _typed(text: str) -> Any:
 
 def test_every_setting_is_covered_here() -> None:
     assert list(TEXTS) == NAMES
+
+
+def test_the_launch_file_has_every_setting_with_its_default() -> None:
+    launch = ElementTree.parse(LAUNCH_FILE).getroot()
+    arguments = {each.get("name"): each.get("default") for each in launch.findall("arg")}
+    node = next(each for each in launch.findall("node") if each.get("type") == "rosbridge_websocket")
+    parameters = {each.get("name"): each.get("value") for each in node.findall("param")}
+    assert parameters == {name: f"$(arg {name})" for name in NAMES}
+    defaults = {name: arguments[name] for name in NAMES}
+    assert load(Settings, defaults, {}) == Settings()
 
 
 def test_defaults_are_those_of_the_launch_file() -> None:

@@ -48,8 +48,8 @@ def _executables(package: str, prefix_path: str) -> List[Path]:
 
 
 def executable(package: str, name: str) -> Path:
-    """The executable of a built package, as rosrun finds it in the devel or install space."""
-    for path in _executables(package, _workspace_environment()["CMAKE_PREFIX_PATH"]):
+    """The executable of a package, as rosrun finds it: in the devel or install space, or the distribution's."""
+    for path in _executables(package, _workspace_environment()["CMAKE_PREFIX_PATH"] + os.pathsep + "/usr"):
         if path.name == name:
             return path
     raise RuntimeError(f"no executable {name} of {package} in the workspace: build first (scripts/test does)")

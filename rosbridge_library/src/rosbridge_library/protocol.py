@@ -278,11 +278,16 @@ class Protocol:
         """Log `message`, and send it to the client when it asked for `level`; `lid` is the id of what caused it."""
         if len(message) > MAX_STATUS_LENGTH:
             message = message[:MAX_STATUS_LENGTH] + "…"  # it quotes what the client sent, which may be megabytes
-        about = f" [id: {lid}]" if lid is not None else ""
+        about = f" [id: {str(lid)[:100]}]" if lid is not None else ""
         logger.log(_LOGGING_LEVELS[level], "[client %s]%s %s", self.client_id, about, message)
         if STATUS_LEVELS[level] <= STATUS_LEVELS[self.status_level]:
             status = {"op": "status", "level": level, "msg": message}
             self.send(status if lid is None else {**status, "id": lid})
+
+    def dropped(self, messages: Mapping[str, int]) -> None:
+        """Tell the client that so many messages of these topics were dropped, since it is slow."""
+        topics = ", ".join(f"{count} of {topic}" for topic, count in sorted(messages.items()))
+        self.log("warning", f"the connection is too slow for all that is subscribed to; dropped messages: {topics}")
 
     def _set_level(self, message: Operation) -> None:
         level, lid = message.get("level"), checked_id(message)

@@ -91,9 +91,10 @@ class WebSocketConnection(websocket.WebSocketProtocol13):
             self._keepalive.stop()
         super().close(code, reason)
 
-    def _send_ping(self) -> None:
+    def _send_ping(self, sent: Callable[[], None]) -> None:
         if not self.is_closing():
-            self.write_ping(b"")
+            ping = self.stream.write(framing.frame_header(framing.PING, 0))
+            ping.add_done_callback(lambda done: sent() if done.exception() is None else None)
 
     def _give_up(self) -> None:
         self._lost()

@@ -12,6 +12,9 @@ topic of large images degrades before the small ones beside it lose anything. Wh
 ``max_bytes``. The transport is handed at most one batch at a time, and none while it still holds unsent
 bytes: what is queued here can still be dropped or overtaken, what is in the transport can't.
 
+A client that takes nothing at all for ``stall_timeout`` while the transport holds bytes for it is given up. What
+is dropped is counted, and told through `on_dropped` at most once a second.
+
 When nothing waits, a message is encoded and written at once. Nothing here blocks, and nothing is a task.
 """
 
@@ -19,17 +22,20 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from typing import Callable, Deque, Dict, List, Optional, Protocol, Tuple
+from typing import Callable, Deque, Dict, List, Mapping, Optional, Protocol, Tuple
 
 from rosbridge_library.payload import Buffer, Payload, Source
 
 logger = logging.getLogger("rosbridge.outbox")
 
-_QUANTUM_BYTES = 65536
+_QUANTUM_BYTES = 16384
 """What a source may send in one turn, on average."""
-_BATCH_BYTES = 65536
+_BATCH_BYTES = 32768
 _BATCH_BUFFERS = 256
 """A write to the transport is closed when it holds this much: so it never has more than one large message."""
+_TELL_INTERVAL_S = 1.0
+_STALL_CHECKS = 4
+"""How often within ``stall_timeout`` it is looked whether a client takes anything."""
 
 
 class Timer(Protocol):
@@ -48,8 +54,13 @@ class Transport(Protocol):
         later."""
         ...
 
-    def overflow(self, reason: str) -> None:
-        """More control messages wait than may: the connection is to be closed (soon, not within this
+    @property
+    def taken_bytes(self) -> int:
+        """How many of the bytes that were written the connection has taken."""
+        ...
+
+    def give_up(self, reason: str) -> None:
+        """The client does not read, as ``reason`` tells: the connection is to be closed (soon, not within this
         call)."""
         ...
 
@@ -97,8 +108,9 @@ class _Lane:
 class ClientOutbox:
     """The `rosbridge_library.payload.Outbox` of one connection.
 
-    ``call_later(seconds, function)`` starts a timer (the loop's); ``delay_between_messages`` is in seconds.
-    Counters: ``sent_messages``, ``sent_bytes`` (without framing), and ``dropped``, messages by topic.
+    ``call_later(seconds, function)`` starts a timer (the loop's); ``delay_between_messages`` and ``stall_timeout``
+    are in seconds, 0 for none. Counters: ``sent_messages``, ``sent_bytes`` (without framing), and ``dropped``,
+    messages by topic. ``on_dropped`` is called with those that were dropped since it was called last.
     """
 
     def __init__(
@@ -109,7 +121,9 @@ class ClientOutbox:
         burst_bytes: int,
         max_bytes: int,
         delay_between_messages: float = 0.0,
+        stall_timeout: float = 0.0,
     ) -> None:
+        self.on_dropped: Optional[Callable[[Mapping[str, int]], None]] = None
         self.sent_messages = 0
         self.sent_bytes = 0
         self.dropped: Dict[str, int] = {}
@@ -118,6 +132,7 @@ class ClientOutbox:
         self._burst_bytes = burst_bytes
         self._max_bytes = max_bytes
         self._delay = delay_between_messages
+        self._stall_timeout = stall_timeout
         self._control: Deque[Payload] = deque()
         self._control_bytes = 0
         self._lanes: Dict[Source, _Lane] = {}
@@ -126,6 +141,11 @@ class ClientOutbox:
         self._behind: List[_Lane] = []  # the lanes with newest_only
         self._held = False  # the transport has unsent bytes
         self._pacing: Optional[Timer] = None
+        self._telling: Optional[Timer] = None
+        self._untold: Dict[str, int] = {}
+        self._watching: Optional[Timer] = None
+        self._taken_bytes = 0  # when it was looked last
+        self._idle_checks = 0
         self._writing = False
         self._closed = False
 
@@ -141,9 +161,7 @@ class ClientOutbox:
         if self._control_bytes >= self._max_bytes:
             # Neither dropping nor growing is allowed here, and a client that reads would not let it come to
             # this.
-            waiting = self._control_bytes
-            self.close()
-            self._transport.overflow(f"{waiting} bytes of responses wait for it")
+            self._give_up(f"{self._control_bytes} bytes of responses wait for it")
             return
         self._control.append(payload)
         self._control_bytes += payload.size
@@ -185,9 +203,10 @@ class ClientOutbox:
     def close(self) -> None:
         """The connection is gone: drops everything, and takes nothing any more."""
         self._closed = True
-        if self._pacing is not None:
-            self._pacing.cancel()
-            self._pacing = None
+        for timer in (self._pacing, self._telling, self._watching):
+            if timer is not None:
+                timer.cancel()
+        self._pacing = self._telling = self._watching = None
         self._control.clear()
         self._lanes.clear()
         self._turns.clear()
@@ -211,6 +230,8 @@ class ClientOutbox:
                 self._held = not self._transport.write(batch)
         finally:
             self._writing = False
+        if self._held:
+            self._watch()
         return True
 
     def _next_batch(self) -> List[Buffer]:
@@ -291,6 +312,9 @@ class ClientOutbox:
         self._topic_bytes -= size
         topic = lane.source.topic
         self.dropped[topic] = self.dropped.get(topic, 0) + 1
+        self._untold[topic] = self._untold.get(topic, 0) + 1
+        if self._telling is None and self.on_dropped is not None:
+            self._telling = self._call_later(0, self._tell)
 
     def _shrink(self) -> None:
         """Drops topic messages until ``max_bytes`` hold, from the source that takes most; one alone may be
@@ -300,3 +324,39 @@ class ClientOutbox:
             if lane.bytes == 0 or (len(lane.waiting) == 1 and lane.bytes == self.waiting_bytes):
                 return
             self._drop_oldest(lane)
+
+    def _tell(self) -> None:
+        self._telling = None
+        if not self._untold or self.on_dropped is None:
+            return
+        self._telling = self._call_later(_TELL_INTERVAL_S, self._tell)
+        if not self._control:  # else what was told last may wait yet: more of it would not help
+            untold, self._untold = self._untold, {}
+            self.on_dropped(untold)
+
+    # A client that takes nothing
+
+    def _watch(self) -> None:
+        if self._stall_timeout > 0 and self._watching is None and not self._closed:
+            self._taken_bytes = self._transport.taken_bytes
+            self._idle_checks = 0
+            self._watch_on()
+
+    def _watch_on(self) -> None:
+        self._watching = self._call_later(self._stall_timeout / _STALL_CHECKS, self._look)
+
+    def _look(self) -> None:
+        self._watching = None
+        if not self._held:
+            return
+        taken = self._transport.taken_bytes
+        self._idle_checks = self._idle_checks + 1 if taken == self._taken_bytes else 0
+        self._taken_bytes = taken
+        if self._idle_checks < _STALL_CHECKS:
+            self._watch_on()
+        else:
+            self._give_up(f"it took nothing for {self._stall_timeout:g} s, and {self.waiting_bytes} bytes wait for it")
+
+    def _give_up(self, reason: str) -> None:
+        self.close()
+        self._transport.give_up(reason)

@@ -45,6 +45,11 @@ class ClientProtocol(Protocol):
 
     def incoming(self, message: Union[str, bytes]) -> Optional[Awaitable[None]]: ...
 
+    def dropped(self, messages: Mapping[str, int]) -> None:
+        """The client is slow, and so many messages of these topics were dropped since this was called last; at most
+        once a second."""
+        ...
+
     def finish(self) -> None: ...
 
 
@@ -212,15 +217,17 @@ class ClientHandler(WebSocketHandler):
         self.ip_address, port = _peer(self)
         self.client_id = server.next_client_id(self.ip_address, port)
         outbox = ClientOutbox(
-            StreamTransport(connection.stream, connection.frame, self._drained, self._overflow),
+            StreamTransport(connection.stream, connection.frame, self._drained, self._give_up),
             asyncio.get_event_loop().call_later,
             burst_bytes=server.settings.burst_bytes,
             max_bytes=server.settings.max_client_bytes,
             delay_between_messages=server.settings.delay_between_messages,
+            stall_timeout=server.settings.stall_timeout,
         )
         make_protocol = server.protocols[self.selected_subprotocol]
         self._outbox = outbox
         self._protocol = make_protocol(self.client_id, server.parameters, outbox)
+        outbox.on_dropped = self._protocol.dropped
         server.connected(self)
 
     def on_message(self, message: Union[str, bytes]) -> Optional[Awaitable[None]]:
@@ -261,7 +268,7 @@ class ClientHandler(WebSocketHandler):
         timeout = self.server.settings.websocket_ping_timeout
         logger.warning("Client %s is closed: nothing came from it for %g s after a ping", self.client_id, timeout)
 
-    def _overflow(self, reason: str) -> None:
+    def _give_up(self, reason: str) -> None:
         logger.warning("Client %s is closed, since it does not read: %s", self.client_id, reason)
         if self._connection is not None:
             asyncio.get_event_loop().call_soon(self._connection.abort)

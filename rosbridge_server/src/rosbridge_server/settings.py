@@ -135,6 +135,9 @@ class Settings:
     )
     burst_bytes: int = setting(MEBIBYTE, BYTES_OR_0, "that may wait for a client before messages are dropped")
     max_client_bytes: int = setting(64 * MEBIBYTE, BYTES, "that may wait for a client at most")
+    stall_timeout: float = setting(
+        30.0, SECONDS, "until a client that takes nothing while something waits for it is closed; 0 for never"
+    )
 
 
 AnySettings = TypeVar("AnySettings")

@@ -6,11 +6,15 @@ On plain TCP a batch of buffers goes to the kernel in one `sendmsg`, without joi
 what the kernel does not take is left to the stream, which sends it when the socket has room and then lets the
 outbox go on. Tornado's own frames (pings, pongs, close) go through the stream too, behind what it still
 holds, so frames never interleave. Over TLS everything goes through the stream.
+
+The kernel is told to hold little that it has not sent, where it can be told so (TCP_NOTSENT_LOWAT): its buffer grows
+to megabytes on a slow link, and what is in there can't be dropped or overtaken any more.
 """
 
 from __future__ import annotations
 
 import logging
+import socket
 from typing import Callable, List, Optional, Tuple
 
 from tornado.concurrent import Future
@@ -20,6 +24,8 @@ from rosbridge_library.payload import Buffer, Framer, Payload
 
 logger = logging.getLogger("rosbridge.transport")
 
+_UNSENT_BYTES = 16384
+"""What the kernel may hold unsent, beside what is on its way: enough to keep a link busy until the loop comes round."""
 _JOIN_BYTES = 65536
 """Buffers up to this size are joined for the stream, which would make a system call of each."""
 
@@ -32,17 +38,25 @@ class StreamTransport:
     """An `outbox.Transport` over ``stream``, with ``frame`` as its framing.
 
     ``drained()`` is called after a write that could not send everything, when all is sent;
-    ``overflow(reason)`` when the outbox gives up on the client.
+    ``give_up(reason)`` when the outbox gives up on the client.
     """
 
     def __init__(
-        self, stream: IOStream, frame: Framer, drained: Callable[[], None], overflow: Callable[[str], None]
+        self, stream: IOStream, frame: Framer, drained: Callable[[], None], give_up: Callable[[str], None]
     ) -> None:
         self.frame: Callable[[Payload], Tuple[Buffer, ...]] = frame
-        self.overflow = overflow
+        self.give_up = give_up
         self._stream = stream
         self._drained = drained
         self._plain = not isinstance(stream, SSLIOStream)
+        self._sent_at_once = 0
+        if hasattr(socket, "TCP_NOTSENT_LOWAT") and not stream.closed():
+            stream.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, _UNSENT_BYTES)
+
+    @property
+    def taken_bytes(self) -> int:
+        """See `outbox.Transport.taken_bytes`. Tornado's own frames count too: they go the same way."""
+        return self._sent_at_once + self._stream._total_write_done_index
 
     def write(self, buffers: List[Buffer]) -> bool:
         """See `outbox.Transport.write`. On a closed stream the bytes are lost, and the stream's owner knows
@@ -58,6 +72,7 @@ class StreamTransport:
             except OSError as error:
                 stream.close(error)
                 return True
+            self._sent_at_once += sent
             buffers = _rest(buffers, sent)
             if not buffers:
                 return True

@@ -24,7 +24,7 @@ from rospy.topics import _SubscriberImpl, _TopicImpl
 from rosbridge_library.codec import MessageType, message_type_from_definition
 from rosbridge_library.internal.exceptions import RosbridgeError
 from rosbridge_library.ros.message import Message, Wire
-from rosbridge_library.ros.tcpros import InboundConnection, LoopTcprosHandler, Receiver
+from rosbridge_library.ros.tcpros import InboundConnection, LoopTcprosHandler, NoPoller, Receiver
 
 if TYPE_CHECKING:
     from rosbridge_library.ros.registrar import Registrar
@@ -248,6 +248,7 @@ class _FeedSubscriber(_SubscriberImpl):  # type: ignore[misc]  # rospy has no ty
 
     def __init__(self, topic: str, data_class: Type[genpy.Message]) -> None:
         _TopicImpl.__init__(self, topic, data_class)
+        NoPoller.replace(self)
         self.callbacks: List[object] = []
         self.queue_size = None
         self.buff_size = 65536

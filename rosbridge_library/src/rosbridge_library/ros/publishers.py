@@ -23,7 +23,7 @@ from rospy.impl.registration import Registration, get_topic_manager
 from rospy.topics import _PublisherImpl
 
 from rosbridge_library.codec import MessageType
-from rosbridge_library.ros.tcpros import LoopTcprosHandler, OutboundConnection
+from rosbridge_library.ros.tcpros import LoopTcprosHandler, NoPoller, OutboundConnection
 
 logger = logging.getLogger("rosbridge.publishers")
 
@@ -176,6 +176,14 @@ class Publishers:
             self._close(publisher)
 
 
+class _LoopPublisher(_PublisherImpl):  # type: ignore[misc]  # rospy has no types
+    """rospy's side of a publisher: what rospy registers and shows."""
+
+    def __init__(self, topic: str, data_class: Type[genpy.Message]) -> None:
+        super().__init__(topic, data_class)
+        NoPoller.replace(self)
+
+
 def _raw_class(type_: MessageType) -> Type[genpy.Message]:
     """A message class for rospy to register and to show in connection headers; it is never serialized."""
 
@@ -196,7 +204,7 @@ def _advertise(topic: str, data_class: Type[genpy.Message], latch: bool) -> _Pub
     with topics.lock:
         publisher = topics.pubs.get(topic)
         if publisher is None:
-            publisher = _PublisherImpl(topic, data_class)
+            publisher = _LoopPublisher(topic, data_class)
             publisher.is_latch = latch
             topics._add(publisher, topics.pubs, Registration.PUB)
         publisher.ref_count += 1

@@ -84,6 +84,8 @@ class Registrar(RegistrationListener):  # type: ignore[misc]  # rospy has no typ
         ):
             for name, type_or_uri in registered:
                 self._known[Entry(kind, name)] = self._wanted[Entry(kind, name)] = type_or_uri
+                if kind == Registration.PUB:
+                    self._stale.add(Entry(kind, name))  # registered again, to know who subscribes: see `settled`
         self._thread.start()
 
     def close(self) -> None:

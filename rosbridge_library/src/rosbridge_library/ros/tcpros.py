@@ -22,9 +22,10 @@ import socket
 import struct
 import threading
 from collections import deque
-from typing import Any, Callable, Deque, Dict, List, Optional, Tuple
+from typing import Any, Callable, Deque, Dict, Iterator, List, Optional, Tuple
 
 import genpy
+import numpy as np
 import rospy
 from rosgraph.network import use_ipv6
 from roslib.message import get_message_class
@@ -35,7 +36,7 @@ from rospy.impl.transport import Transport
 
 from rosbridge_library.ros.master import NodeApi, NodeError, NodeUnreachable
 from rosbridge_library.ros.message import Wire
-from rosbridge_library.ros.tcpros_header import HeaderError, decode_header, encode_header
+from rosbridge_library.ros.tcpros_header import LENGTH_BYTES, HeaderError, decode_header, decode_length, encode_header
 
 logger = logging.getLogger("rosbridge.tcpros")
 
@@ -102,6 +103,31 @@ class LoopTcprosHandler(TCPROSHandler):  # type: ignore[misc]  # rospy has no ty
         publisher.add_connection(connection)
         self.loop.call_soon_threadsafe(connection.start, attach)
         return None
+
+
+class NoPoller:
+    """Takes the place of a topic's poller, in which rospy looks for lost connections: ours notice that themselves.
+
+    rospy's is an open file that refers to itself, so each topic would leave one behind until the garbage is collected.
+    """
+
+    def add_fd(self, fd: int) -> None:
+        """A connection has come; ours have no file for rospy."""
+
+    def remove_fd(self, fd: int) -> None:
+        """A connection has gone."""
+
+    def error_iter(self) -> Iterator[int]:
+        """The files with errors."""
+        return iter(())
+
+    @classmethod
+    def replace(cls, topic: Any) -> None:
+        """Have `topic`, rospy's publisher or subscriber, poll no more."""
+        poller: Any = topic.connection_poll.poller
+        topic.connection_poll = cls()
+        if hasattr(poller, "close"):
+            poller.close()
 
 
 class _LoopTransport(TCPROSTransport):  # type: ignore[misc]
@@ -199,6 +225,7 @@ class InboundConnection(_LoopTransport):
             self._task.cancel()
         if self._calls is not None:
             self._calls.close()
+        self._large = None
         super()._close_on_loop()
 
     async def _run(self) -> None:
@@ -295,16 +322,15 @@ class InboundConnection(_LoopTransport):
 
     async def _read_header(self, sock: socket.socket) -> Tuple[bytes, bytes]:
         """The connection header, and what came behind it: at most READ_BYTES."""
-        read = b""
-        while len(read) < 4 or len(read) < 4 + _LENGTH.unpack_from(read)[0]:
-            if len(read) >= 4 and _LENGTH.unpack_from(read)[0] > MAX_MESSAGE_BYTES:
-                raise HeaderError("the connection header's length is corrupt")
+        read, end = bytearray(), LENGTH_BYTES
+        while len(read) < end:
             chunk = await self.loop.sock_recv(sock, 4096)
             if not chunk:
                 raise HeaderError("the publisher closed the connection before its header")
             read += chunk
-        end = 4 + _LENGTH.unpack_from(read)[0]
-        return read[4:end], read[end:]
+            if end == LENGTH_BYTES and len(read) >= LENGTH_BYTES:
+                end += decode_length(bytes(read[:LENGTH_BYTES]))
+        return bytes(read[LENGTH_BYTES:end]), bytes(read[end:])
 
     async def _receive(self) -> str:
         """Wait until the connection ends; why it did."""
@@ -312,6 +338,7 @@ class InboundConnection(_LoopTransport):
         return await self._lost
 
     def _lose(self, reason: str) -> None:
+        self._large = None
         if self.socket is not None:
             self.loop.remove_reader(self.socket)
         if self._lost is not None and not self._lost.done():
@@ -351,7 +378,13 @@ class InboundConnection(_LoopTransport):
                     self._lose(f"corrupt: a message of {length} bytes")
                     return
                 if 4 + length > len(buffer):
-                    self._large = memoryview(bytearray(length))
+                    try:
+                        # Its pages are taken as it is filled: a length alone, which may be a lie, costs nothing.
+                        self._large = np.empty(length, np.uint8).data
+                    except MemoryError:
+                        self._buffered = 0
+                        self._lose(f"there is no memory for a message of {length} bytes")
+                        return
                     self._large_read = end - at - 4
                     self._large[: self._large_read] = buffer[at + 4 : end]
                     at = end
