@@ -31,7 +31,7 @@ from support.ros import RosMaster
 from support.usage import usage
 from support.wait import wait_until
 
-SECONDS = float(os.environ.get("ROSBRIDGE_FUZZ_SECONDS", "3"))
+SECONDS = float(os.environ.get("ROSBRIDGE_FUZZ_SECONDS", "2"))
 FIRST_SEED = int(os.environ.get("ROSBRIDGE_FUZZ_SEED", "0")) or (1 if SECONDS <= 3 else SystemRandom().randrange(2**40))
 ADD = "rosbridge_library/AddTwoInts"
 
