@@ -688,8 +688,15 @@ def test_a_message_that_does_not_conform_is_dropped_with_an_error(bridge: Bridge
 
 
 def test_a_topic_that_the_bridge_itself_publishes_is_there_at_once(start_bridge, connect, peer: Peer):
-    client = connect(start_bridge(name="speaking"))
+    speaking = start_bridge(name="speaking")
+    client = connect(speaking)
     peer.subscribe("/rosout", "rosgraph_msgs/Log")
+
+    def is_heard() -> bool:
+        connect(speaking).close()  # which it logs
+        return any(log["name"] == "/speaking" for log in peer.received("/rosout"))
+
+    wait_until(is_heard)
     begin = time.monotonic()
     client.publish("/rosout", {"level": 2, "name": "/page", "msg": "from a client"})
     client.sync()

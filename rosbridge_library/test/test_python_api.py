@@ -77,6 +77,7 @@ protocol.incoming(json.dumps({"op": "advertise", "topic": "/api/out", "type": "s
 protocol.incoming(json.dumps({"op": "publish", "topic": "/api/out", "msg": {"data": "out"}}))
 until(lambda: received)
 rospy.Service("/api/add", AddTwoInts, lambda request: AddTwoIntsResponse(request.a + request.b))
+rospy.wait_for_service("/api/add", 10)
 protocol.incoming(json.dumps({"op": "call_service", "service": "/api/add", "args": [1, 2], "id": "c"}))
 response = protocol.wait(op="service_response", id="c")
 protocol.incoming(json.dumps({"op": "advertise_service", "id": "a", "service": "/api/mine",

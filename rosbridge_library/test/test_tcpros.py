@@ -45,6 +45,9 @@ class Record(Receiver):
     def refused(self, connection: InboundConnection, reason: str) -> None:
         self._note(f"refused: {reason}")
 
+    def given_up(self, topic: str) -> None:
+        self._note(f"given up {topic}")
+
     def _note(self, event: str) -> None:
         self.events.append(event)
         self.changed.set()
@@ -78,7 +81,8 @@ def run(serve: Callable[[asyncio.StreamWriter], Awaitable[None]], check: Callabl
 
         server = await asyncio.start_server(publisher, "127.0.0.1", 0)
         address = server.sockets[0].getsockname()
-        handler, record = LoopTcprosHandler(loop), Record()
+        record = Record()
+        handler = LoopTcprosHandler(loop, record.given_up)
         handler.inbound[TOPIC] = record
         subscriber = _FeedSubscriber(TOPIC, _any_type("*"))
         connection = InboundConnection(handler, subscriber, address, "http://127.0.0.1:1/")
@@ -229,6 +233,20 @@ def test_a_topic_that_ends_leaves_no_file_open_until_the_garbage_is_collected(of
         assert len(os.listdir("/proc/self/fd")) <= before + 1
     finally:
         gc.enable()
+
+
+def test_when_a_publisher_is_given_up_the_master_is_asked_again() -> None:
+    """It may be back, and rospy have thought that it was connected still."""
+
+    async def serve(writer: asyncio.StreamWriter) -> None:
+        writer.write(encode_header(HEADER) + frame(b"last"))
+        writer.close()
+
+    async def check(record: Record) -> None:
+        await record.until(lambda: f"given up {TOPIC}" in record.events)
+        assert record.events == ["connected", "disconnected", f"given up {TOPIC}"]
+
+    run(serve, check)
 
 
 def test_a_publisher_that_never_answers_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:

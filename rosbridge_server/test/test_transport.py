@@ -21,7 +21,10 @@ def test_any_number_of_buffers_arrives_in_order(count: int, size: int) -> None:
     expected = b"".join(buffers)
 
     async def main() -> bytes:
-        ours, theirs = socket.socketpair()
+        listener = socket.create_server(("127.0.0.1", 0))
+        theirs = socket.create_connection(listener.getsockname())
+        ours, _ = listener.accept()
+        listener.close()
         theirs.setblocking(False)
         stream = IOStream(ours)
         transport = StreamTransport(

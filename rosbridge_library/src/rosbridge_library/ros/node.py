@@ -73,7 +73,7 @@ class Node:
         self.master = Master(self.caller_id, timeout=MASTER_TIMEOUT_S)
         self._threads = ThreadPoolExecutor(CALL_THREADS, thread_name_prefix="ros-call")
         self._registrar = Registrar(self.master)
-        self._handler = LoopTcprosHandler(loop)
+        self._handler = LoopTcprosHandler(loop, functools.partial(self._registrar.renew, Registration.SUB))
         self.feeds = Feeds(loop, self._handler, self._registrar, self.now)
         self.publishers = Publishers(loop, self._handler, unregister_timeout_s)
         self.services = ServiceCaller(self.call, self.master, self.caller_id)

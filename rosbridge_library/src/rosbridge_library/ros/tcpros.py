@@ -53,12 +53,17 @@ _LENGTH = struct.Struct("<I")
 
 
 class LoopTcprosHandler(TCPROSHandler):  # type: ignore[misc]  # rospy has no types
-    """Makes topic connections that live on `loop`. `on_connection` is told, on the loop, of each subscriber of a topic
-    that has a publisher in `outbound`, and each publisher's messages go to the receiver in `inbound`."""
+    """Makes topic connections that live on `loop`.
 
-    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+    What publishers of a topic send goes to the receiver in `inbound`; a subscriber of a topic goes to the function in
+    `outbound`. `renew(topic)` is called when a connection to a publisher has been given up: the publisher may have come
+    back meanwhile, and rospy did not connect to it since the connection was still there.
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, renew: Callable[[str], None]) -> None:
         super().__init__()
         self.loop = loop
+        self.renew = renew
         self.inbound: Dict[str, Receiver] = {}
         self.outbound: Dict[str, Callable[[OutboundConnection], None]] = {}
 
@@ -250,7 +255,8 @@ class InboundConnection(_LoopTransport):
                 await asyncio.sleep(delay_s)
                 delay_s = min(delay_s * 2, RETRY_MAX_S)
                 if not await self.loop.run_in_executor(None, self._renegotiate):
-                    break
+                    self.close()
+                    self._handler.renew(self.topic)
         except asyncio.CancelledError:
             if self._lost is not None:
                 self._tell("disconnected")
