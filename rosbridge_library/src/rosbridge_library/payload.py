@@ -9,7 +9,7 @@ may be shared by all the clients that want it: its transport framing is made onc
 
 from __future__ import annotations
 
-from typing import Callable, Dict, Optional, Protocol, Sequence, Tuple, Union
+from typing import Callable, Dict, Mapping, Optional, Protocol, Sequence, Tuple, Union
 
 Buffer = Union[bytes, bytearray, memoryview]
 """Bytes that are not changed any more once they are in a payload (a memoryview must be of bytes, ``itemsize``
@@ -82,6 +82,16 @@ class Source(Protocol):
 class Outbox(Protocol):
     """Everything that waits to be sent to one client. All methods are called on the loop and return at
     once."""
+
+    @property
+    def dropped(self) -> Mapping[str, int]:
+        """How many messages of each topic were dropped so far."""
+        ...
+
+    @property
+    def waiting_bytes(self) -> int:
+        """How much waits."""
+        ...
 
     def send(self, payload: Payload) -> None:
         """Sends on the control lane: in order, never dropped, before any topic message that waits."""

@@ -20,11 +20,13 @@ from typing import (
     Any,
     Awaitable,
     Callable,
+    ClassVar,
     Deque,
     Dict,
     List,
     Mapping,
     Optional,
+    Sequence,
     Set,
     Type,
     Union,
@@ -61,9 +63,6 @@ MAX_STATUS_LENGTH = 1000
 FINISH_TIMEOUT_S = 2.0
 """How long what a client sent before it left may take to be published."""
 
-# What a client that is gone wanted all the same: a script publishes, and closes its connection.
-_OUTLIVING = ("advertise", "publish", "unadvertise", "fragment", "png")
-
 Handler = Callable[[Operation], Optional[Awaitable[None]]]
 
 
@@ -73,6 +72,9 @@ class Protocol:
     `node` is the shared ROS side; a protocol made without one uses that of `ros.node.background_node`, whose loop runs
     in a thread, and its methods may then be called from any thread.
     """
+
+    # What a client that is gone wanted all the same: a script publishes, and closes its connection.
+    outliving: ClassVar[Sequence[str]] = ("advertise", "publish", "unadvertise", "fragment", "png")
 
     def __init__(
         self,
@@ -176,7 +178,7 @@ class Protocol:
         """Begin one decoded operation. Returns what to wait for when it isn't finished yet. Never raises."""
         try:
             handler = self._handler(operation)
-            if self.finished and operation["op"] not in _OUTLIVING:
+            if self.finished and operation["op"] not in self.outliving:
                 return None
             pending = handler(operation)
         except Exception as error:  # noqa: BLE001  # reported, whatever it is
@@ -280,6 +282,10 @@ class Protocol:
             message = message[:MAX_STATUS_LENGTH] + "…"  # it quotes what the client sent, which may be megabytes
         about = f" [id: {str(lid)[:100]}]" if lid is not None else ""
         logger.log(_LOGGING_LEVELS[level], "[client %s]%s %s", self.client_id, about, message)
+        self.send_status(level, message, lid)
+
+    def send_status(self, level: str, message: str, lid: OperationId) -> None:
+        """Tell the client, if it asked for `level`."""
         if STATUS_LEVELS[level] <= STATUS_LEVELS[self.status_level]:
             status = {"op": "status", "level": level, "msg": message}
             self.send(status if lid is None else {**status, "id": lid})
@@ -323,7 +329,7 @@ class Protocol:
 
     def _finish_now(self) -> None:
         self.finished = True
-        outlives = self._working is not None and self._working_on in _OUTLIVING
+        outlives = self._working is not None and self._working_on in self.outliving
         for task in self._tasks:
             if not outlives or task is not self._working:
                 task.cancel()
@@ -357,6 +363,8 @@ class _CallOutgoing:
     """The outbox of a protocol that has none: everything goes to `outgoing` at once."""
 
     def __init__(self, protocol: Protocol) -> None:
+        self.dropped: Dict[str, int] = {}
+        self.waiting_bytes = 0
         self._protocol = protocol
 
     def send(self, payload: Payload) -> None:

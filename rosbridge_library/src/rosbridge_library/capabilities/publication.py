@@ -12,13 +12,14 @@ from typing import Dict, Hashable, List, Optional, Set
 from rospy.impl.registration import Registration
 
 from rosbridge_library.capability import OperationId
-from rosbridge_library.codec import MessageType, get_message_type
-from rosbridge_library.internal.exceptions import RosbridgeError
+from rosbridge_library.codec import MessageType, get_message_type, message_type_from_definition
+from rosbridge_library.internal.exceptions import RosbridgeError, TypeLoadError
 from rosbridge_library.internal.ros_loader import canonical_type_name
 from rosbridge_library.names import checked_global_name
 from rosbridge_library.protocol import Protocol
+from rosbridge_library.ros.graph import TopicInfo
 from rosbridge_library.ros.master import MasterUnreachable
-from rosbridge_library.ros.node import Node, RosTimeout, TopicInfo
+from rosbridge_library.ros.node import Node, RosTimeout
 from rosbridge_library.ros.publishers import DEFAULT_QUEUE_SIZE, Publisher
 
 MAX_QUEUE_SIZE = 2**31 - 1
@@ -60,10 +61,14 @@ class Publications:
         advertise_id: OperationId,
         latch: bool,
         queue_size: Optional[int],
+        definition: Optional[str] = None,
     ) -> Publisher:
         """Advertise `topic`, of the type that it has when none is given.
 
-        Raises InvalidArgumentException for an illegal name, AccessDenied, TypeLoadError, TopicConflict, MasterError.
+        `definition` is the full text of the type, for one that is not installed here.
+
+        Raises InvalidArgumentException for an illegal name, AccessDenied, TypeLoadError, DefinitionError,
+        TopicConflict, MasterError.
         """
         name = checked_global_name(topic, "topic")
         if not self.node.access.may_publish(name):
@@ -73,7 +78,7 @@ class Publications:
         type_ = self._type_of_ours(name, type_name, latch)
         if type_ is None:
             info = await self._look_up(name, type_name, advertise_id)
-            type_ = await self._type(name, type_name, info)
+            type_ = await self._type(name, type_name, info, definition)
             self._may_still_open(name, type_)
         publisher = self.node.publishers.open(
             name,
@@ -125,10 +130,12 @@ class Publications:
             self._protocol.log("error", f"{error}; {name} will be advertised when it is back", lid)
             return None
 
-    async def _type(self, name: str, type_name: Optional[str], info: Optional[TopicInfo]) -> MessageType:
+    async def _type(
+        self, name: str, type_name: Optional[str], info: Optional[TopicInfo], definition: Optional[str]
+    ) -> MessageType:
         ours = self.node.publishers.get(name)
         if ours is not None and (ours.users or type_name is None):
-            if type_name is not None and ours.type.name != (await self._installed(type_name)).name:
+            if type_name is not None and ours.type.name != (await self._given(type_name, definition)).name:
                 raise TopicConflict(f"{name} is already advertised by clients as {ours.type.name}, not {type_name}")
             return ours.type
         present = self.node.publishers.type_in_rospy(name) or ""
@@ -140,11 +147,24 @@ class Publications:
             if not present:
                 raise TopicConflict(f"{name} does not exist, so it has no type: advertise it with one first")
             return await self._installed(present)
-        type_ = await self._installed(type_name)
+        type_ = await self._given(type_name, definition)
         if present not in ("", type_.name):
             users = ", ".join(info.publishers or info.subscribers) if info is not None else ""
             raise TopicConflict(f"{name} already has type {present}, not {type_.name}; it is used by {users}")
         return type_
+
+    async def _given(self, type_name: str, definition: Optional[str]) -> MessageType:
+        """The type that the client names, which must be the one that it defines, if it does."""
+        if definition is None:
+            return await self._installed(type_name)
+        defined = message_type_from_definition(type_name, definition)
+        try:
+            installed = await self._installed(type_name)
+        except TypeLoadError:
+            return defined
+        if defined.md5sum != installed.md5sum:
+            raise TopicConflict(f"{type_name} is defined here in another way than the client defines it")
+        return installed
 
     async def _installed(self, type_name: str) -> MessageType:
         return await self.node.call(get_message_type, type_name)

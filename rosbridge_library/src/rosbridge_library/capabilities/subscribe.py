@@ -21,9 +21,10 @@ from rosbridge_library.internal.ros_loader import canonical_type_name
 from rosbridge_library.names import checked_global_name
 from rosbridge_library.payload import Payload
 from rosbridge_library.ros.feeds import Feed, Sink
+from rosbridge_library.ros.graph import TopicInfo
 from rosbridge_library.ros.master import MasterError, MasterUnreachable
 from rosbridge_library.ros.message import Message
-from rosbridge_library.ros.node import RosTimeout, TopicInfo
+from rosbridge_library.ros.node import RosTimeout
 
 if TYPE_CHECKING:
     from rosbridge_library.protocol import Protocol

@@ -70,6 +70,10 @@ class MessageType:
         convert: Callable[[Wire], Tuple[Piece, ...]] = self._compiled("cbor_pieces", compile_cbor_pieces)
         return convert(wire)
 
+    def check(self, wire: Wire) -> None:
+        """Raise WireError for bytes that are no message of this type."""
+        self.cbor_pieces(wire)  # walks through all of it, and copies no large array
+
     def to_values(self, wire: Wire) -> Dict[str, Any]:
         """The fields of a serialized message as Python values; raises WireError.
 

@@ -10,6 +10,7 @@ it). The calls block: on the event loop they belong on the thread pool.
 from __future__ import annotations
 
 import http.client
+import re
 import socket
 import time
 import urllib.parse
@@ -21,6 +22,9 @@ import rosgraph
 
 from rosbridge_library.internal.exceptions import RosbridgeError
 from rosbridge_library.ros.network_errors import describe
+
+# What XML 1.0 has no character for (section 2.2). The master answers it with an HTTP error, as if it were broken.
+_NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 # The state of a graph of ten thousand topics is about 2 MB; what is far longer is no answer.
 MAX_ANSWER_BYTES = 64 * 1024 * 1024
@@ -43,7 +47,7 @@ class MasterError(NodeError):
 
 
 class UnsupportedValue(RosbridgeError):
-    """An argument has no XML-RPC form: None, an integer beyond 32 bits, half a surrogate pair."""
+    """An argument has no XML-RPC form: None, an integer beyond 32 bits, control characters, half a surrogate pair."""
 
 
 class NodeApi:
@@ -133,7 +137,8 @@ class _DeadlineSocket(socket.socket):
         return super().recv_into(buffer, nbytes, flags)
 
 
-def _connect(host: str, port: int, deadline: float) -> _DeadlineSocket:
+def connect_until(host: str, port: int, deadline: float) -> socket.socket:
+    """A connected socket whose operations all end at `deadline` (on time.monotonic). Raises OSError."""
     failure: Optional[OSError] = None
     for family, kind, protocol, _, address in socket.getaddrinfo(host, port, 0, socket.SOCK_STREAM):
         sock = _DeadlineSocket(family, kind, protocol)
@@ -155,7 +160,7 @@ def _post(uri: str, body: bytes, deadline: float) -> Tuple[int, bytes]:
     if parts.scheme != "http" or not parts.hostname:
         raise ValueError("its address is not of the form http://host:port/")
     connection = http.client.HTTPConnection(parts.hostname, parts.port)
-    connection.sock = _connect(connection.host, connection.port, deadline)
+    connection.sock = connect_until(connection.host, connection.port, deadline)
     try:
         headers = {"Content-Type": "text/xml", "Connection": "close"}
         connection.request("POST", parts.path or "/", body, headers)
@@ -170,6 +175,9 @@ def _post(uri: str, body: bytes, deadline: float) -> Tuple[int, bytes]:
 
 def _encode_call(method: str, args: Tuple[Any, ...]) -> bytes:
     try:
-        return xmlrpc.client.dumps(args, method).encode("utf-8")
+        text = xmlrpc.client.dumps(args, method)
+        if _NOT_XML.search(text):
+            raise UnsupportedValue(f"the arguments of {method} have control characters, which XML-RPC can't carry")
+        return text.encode("utf-8")
     except (TypeError, OverflowError, UnicodeError, RecursionError) as error:
         raise UnsupportedValue(f"the arguments of {method} can't be sent over XML-RPC: {error}") from error

@@ -16,7 +16,7 @@ import functools
 import logging
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, Callable, List, NamedTuple, Optional, Tuple, TypeVar
+from typing import Any, Callable, Optional, Tuple, TypeVar
 
 import rospy
 import rospy.impl.tcpros
@@ -27,7 +27,9 @@ from rosbridge_library.access import Access
 from rosbridge_library.internal.exceptions import RosbridgeError
 from rosbridge_library.ros.accepting import relieve_accept_thread
 from rosbridge_library.ros.feeds import Feeds
+from rosbridge_library.ros.graph import Graph, GraphWatch, TopicInfo, ask_graph
 from rosbridge_library.ros.master import Master, MasterUnreachable
+from rosbridge_library.ros.param_watch import ParamWatch
 from rosbridge_library.ros.providers import ServiceProviders
 from rosbridge_library.ros.publishers import Publishers
 from rosbridge_library.ros.registrar import Registrar
@@ -50,14 +52,6 @@ class RosTimeout(RosbridgeError):
     """A blocking ROS call didn't end in time."""
 
 
-class TopicInfo(NamedTuple):
-    """What the master knows of a topic: its type ("" when unknown), and the nodes that publish and subscribe."""
-
-    type: str
-    publishers: List[str]
-    subscribers: List[str]
-
-
 class Node:
     """Feeds, publishers, services and the master, for one process. All methods are for the loop's thread."""
 
@@ -78,14 +72,17 @@ class Node:
         self.publishers = Publishers(loop, self._handler, unregister_timeout_s)
         self.services = ServiceCaller(self.call, self.master, self.caller_id)
         self.providers = ServiceProviders(self.call, self.master, self.caller_id)
-        self._topic_lookup: Optional[asyncio.Task[_Graph]] = None
-        self._graph: Optional[_Graph] = None
+        self.graph_watch = GraphWatch(self._ask_graph)
+        self.param_watch = ParamWatch(loop, self.master, self._registrar, self.call)
+        self._topic_lookup: Optional[asyncio.Task[Graph]] = None
+        self._graph: Optional[Graph] = None
         self._graph_time_s = 0.0
 
     async def start(self) -> None:
         """Take rospy's place at the topic sockets and at the master. Raises RuntimeError before rospy.init_node."""
         relieve_accept_thread()
         self._registrar.install()
+        self.param_watch.install()
         rospy.impl.tcpros._handler = self._handler
         rospy.impl.tcpros_base._tcpros_server.topic_connection_handler = self._handler.topic_connection_handler
         self._registrar.rospy_registration.handler.protocol_handlers[:] = [self._handler]
@@ -97,6 +94,7 @@ class Node:
 
     async def stop(self) -> None:
         """End every feed, publisher and provided service. Doesn't wait for the master."""
+        self.graph_watch.close()
         self.feeds.close_all()
         self.publishers.close_all()
         await self.providers.close()
@@ -132,6 +130,16 @@ class Node:
             reason = self._registrar.trouble or f"the master did not register {name} within {MASTER_TIMEOUT_S:g} s"
             raise MasterUnreachable(reason) from None
 
+    @property
+    def master_generation(self) -> int:
+        """Counts up when the master is found to have been started anew."""
+        return self._registrar.generation
+
+    @staticmethod
+    def is_simulated() -> bool:
+        """Whether time is that of /clock: /use_sim_time was set when this node began."""
+        return not rospy.rostime.is_wallclock()
+
     @staticmethod
     def now() -> Tuple[int, int]:
         """ROS time as seconds and nanoseconds: simulated time when /use_sim_time is set."""
@@ -160,28 +168,16 @@ class Node:
         graph = await asyncio.shield(lookup)
         return graph.topic(topic)
 
-    async def _look_up_topics(self) -> _Graph:
+    async def _look_up_topics(self) -> Graph:
         await asyncio.sleep(0)  # whoever asks in this turn of the loop is served too
         self._topic_lookup = None
+        return await self._ask_graph()
+
+    async def _ask_graph(self) -> Graph:
         time_s = self.loop.time()
-        graph = await self.call(self._ask_graph, timeout=2 * MASTER_TIMEOUT_S + 1)
+        graph = await self.call(ask_graph, self.master, timeout=2 * MASTER_TIMEOUT_S + 1)
         self._graph, self._graph_time_s = graph, time_s
         return graph
-
-    def _ask_graph(self) -> _Graph:
-        publishers, subscribers, _ = self.master.call("getSystemState")
-        return _Graph(dict(publishers), dict(subscribers), dict(self.master.call("getTopicTypes")))
-
-
-class _Graph(NamedTuple):
-    publishers: Any
-    subscribers: Any
-    types: Any
-
-    def topic(self, topic: str) -> TopicInfo:
-        publishers, subscribers = self.publishers.get(topic, []), self.subscribers.get(topic, [])
-        type_ = self.types.get(topic, "") if publishers or subscribers else ""
-        return TopicInfo("" if type_ == "*" else type_, publishers, subscribers)
 
 
 class _Background:

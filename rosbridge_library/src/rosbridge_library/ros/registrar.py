@@ -61,6 +61,8 @@ class Registrar(RegistrationListener):  # type: ignore[misc]  # rospy has no typ
         self._thread = threading.Thread(target=self._run, name="registrar", daemon=True)
         self.trouble: Optional[str] = None
         """Why the master can't be told now, or None."""
+        self.generation = 0
+        """How often the master was found to have forgotten this node: it was started anew each time."""
 
     @property
     def rospy_registration(self) -> RegManager:
@@ -168,6 +170,7 @@ class Registrar(RegistrationListener):  # type: ignore[misc]  # rospy has no typ
         if not self._closed and (not stale or self.trouble) and not self._master_knows_us():
             logger.warning("the master at %s has forgotten this node; registering everything again", self._master.uri)
             self._known.clear()
+            self.generation += 1
         for entry in [each for each in self._known if each not in wanted]:
             self._unregister(entry, self._known[entry])
         for entry, type_or_uri in wanted.items():

@@ -19,7 +19,7 @@ from typing import Any, Awaitable, Callable, Dict, List, Mapping, NamedTuple, Op
 from weakref import WeakValueDictionary
 
 from rosbridge_library.codec import MessageType, ServiceType, get_service_type
-from rosbridge_library.internal.exceptions import RosbridgeError, ValuesError
+from rosbridge_library.internal.exceptions import RosbridgeError, ValuesError, WireError
 from rosbridge_library.ros.master import Master, MasterError
 from rosbridge_library.ros.service_connection import (
     ConnectionEnded,
@@ -54,7 +54,7 @@ MAX_ERROR_BYTES = 1024 * 1024
 # after 1, 3, 7, 15 seconds. So of a burst of calls to one node only this many connect at a time.
 CONNECTING_PER_NODE = 4
 
-Arguments = Union[Mapping[str, Any], Sequence[Any], None]
+Arguments = Union[Mapping[str, Any], Sequence[Any], bytes, None]
 Clock = Callable[[], Tuple[int, int]]
 
 _answer_prefix = struct.Struct("<BI")
@@ -150,13 +150,14 @@ class ServiceCaller:
     ) -> ServiceReply:
         """Call `service`, a global name, and return its response.
 
-        `arguments` are the request's values: by name, or a list of them in the order of the fields.
+        `arguments` are the request's values: by name, or a list of them in the order of the fields. Bytes are the
+        serialized request itself.
         `type_name` is used for a provider that does not say its type, and else ignored. The call takes no
         longer than `timeout` seconds, look-up included; 0 is no limit, None the default. `now` gives the
         ROS time for stamps. Cancelling closes the connection.
 
-        Raises a ServiceError, MasterUnreachable, or the ValuesError of arguments that don't conform to the
-        type.
+        Raises a ServiceError, MasterUnreachable, or the ValuesError or WireError of arguments that don't conform
+        to the type.
         """
         seconds = self.default_timeout if timeout is None else timeout
         progress = _Progress()
@@ -183,7 +184,7 @@ class ServiceCaller:
         if kept is not None:
             try:
                 return await self._call_known(kept, arguments, now, progress)
-            except (ServiceUnreachable, InvalidServiceArguments, ValuesError):
+            except (ServiceUnreachable, InvalidServiceArguments, ValuesError, WireError):
                 # Nothing was sent: the service has moved, or has another type now.
                 progress.stage = "looking it up again"
         found = await self._find(name, type_name)
@@ -280,6 +281,9 @@ class ServiceCaller:
 
 def _encode_request(service: _Service, arguments: Arguments, now: Clock) -> Tuple[bytes, List[str]]:
     request = service.type.request
+    if isinstance(arguments, bytes):
+        request.check(arguments)
+        return arguments, []
     if arguments is None:
         values: Mapping[str, Any] = {}
     elif isinstance(arguments, Mapping):

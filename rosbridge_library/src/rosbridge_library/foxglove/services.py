@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: BSD-3-Clause
+"""advertiseServices, unadvertiseServices and service calls.
+
+`Services` is what this server offers, the same for all clients. The master does not know the types of services, so
+each provider is asked, with a short deadline; one that does not answer is left out, and asked again later. Calls run
+beside each other and beside everything else that a client does.
+"""
+
+from __future__ import annotations
+
+import logging
+from typing import Any, Dict, List, NamedTuple, Optional, Sequence
+
+from rosbridge_library.capabilities.publication import AccessDenied
+from rosbridge_library.capability import Capability, Operation
+from rosbridge_library.codec import ServiceType, decode_json, get_service_type
+from rosbridge_library.foxglove import messages
+from rosbridge_library.foxglove.latest import Latest
+from rosbridge_library.foxglove.options import Options, matches
+from rosbridge_library.foxglove.protocol import FoxgloveProtocol
+from rosbridge_library.foxglove.topics import RETRY_S, Ids
+from rosbridge_library.internal.exceptions import InvalidArgumentException, RosbridgeError
+from rosbridge_library.ros.graph import Graph
+from rosbridge_library.ros.master import Master, MasterError
+from rosbridge_library.ros.node import Node
+from rosbridge_library.ros.service_probe import probe_services
+
+logger = logging.getLogger("rosbridge.foxglove")
+
+PROBED_AT_ONCE = 64
+"""So many services share one deadline: a robot may have a thousand."""
+
+
+class OfferedService(NamedTuple):
+    """One service as clients see it."""
+
+    id: int
+    name: str
+    type: ServiceType
+
+    def advertisement(self) -> Dict[str, Any]:
+        """Its entry in an advertiseServices message."""
+        return messages.service(self.id, self.name, self.type.name, self.type.request, self.type.response)
+
+
+class Services:
+    """The services, by name. Belongs to the node's loop."""
+
+    def __init__(self, node: Node, options: Options) -> None:
+        self.offered: Dict[str, OfferedService] = {}
+        self.known = False
+        self._node = node
+        self._options = options
+        self._timeout_s = options.service_type_retrieval_timeout_ms / 1000
+        self._audiences: List[ServiceCalls] = []
+        self._ids = Ids()
+        self._providers: Dict[str, List[str]] = {}  # those that the type of an offered service was learnt from
+        self._retry_at_s: Dict[str, float] = {}
+        self._following: Latest[Graph] = Latest(self._follow)
+
+    def may_see(self, service: str) -> bool:
+        """Whether clients may know of `service`, and call it."""
+        return self._node.access.may_call(service) and matches(self._options.service_whitelist, service)
+
+    def add(self, audience: ServiceCalls) -> None:
+        """Tell `audience` of all that is there, and of every change."""
+        self._audiences.append(audience)
+        if self.offered:
+            audience.services_changed(list(self.offered.values()), ())
+
+    def remove(self, audience: ServiceCalls) -> None:
+        """Tell it no more."""
+        self._audiences.remove(audience)
+
+    def follow(self, graph: Optional[Graph]) -> None:
+        """Bring the services in line with the graph; without one, what there is stays."""
+        if graph is not None:
+            self._following.take(graph)
+
+    def forget(self) -> None:
+        """Nobody follows the graph any more: what there is will be found anew. Ids stay."""
+        self._following.cancel()
+        self.offered.clear()
+        self._providers.clear()
+        self._retry_at_s.clear()
+
+    async def _follow(self, graph: Graph) -> None:
+        provided = {name: nodes for name, nodes in graph.services.items() if nodes and self.may_see(name)}
+        gone = [service for name, service in self.offered.items() if provided.get(name) != self._providers.get(name)]
+        self._change([], gone)
+        for name in [name for name in self._retry_at_s if name not in provided]:
+            del self._retry_at_s[name]
+        now_s = self._node.loop.time()
+        unknown = sorted(
+            name for name in provided if name not in self.offered and self._retry_at_s.get(name, 0.0) <= now_s
+        )
+        for start in range(0, len(unknown), PROBED_AT_ONCE):
+            await self._learn(unknown[start : start + PROBED_AT_ONCE], provided)
+
+    async def _learn(self, names: Sequence[str], provided: Dict[str, List[str]]) -> None:
+        uris = await self._node.call(_look_up, self._node.master, names)
+        headers = await probe_services(uris, self._node.caller_id, self._timeout_s)
+        type_names = {name: header["type"] for name, header in headers.items() if _tells_type(header)}
+        types = await self._node.call(_load, sorted(set(type_names.values())))
+        added = []
+        for name in names:
+            type_ = types.get(type_names.get(name, ""))
+            if type_ is None:
+                self._retry_at_s[name] = self._node.loop.time() + RETRY_S
+                logger.debug("%s is left out: %s", name, type_names.get(name, headers.get(name)))
+                continue
+            self._providers[name] = provided[name]
+            added.append(OfferedService(self._ids.of((name, type_.name, type_.md5sum)), name, type_))
+        self._change(added, [])
+
+    def _change(self, added: List[OfferedService], gone: List[OfferedService]) -> None:
+        for service in gone:
+            del self.offered[service.name]
+            del self._providers[service.name]
+        self.offered.update({service.name: service for service in added})
+        if added or gone:
+            for audience in list(self._audiences):
+                audience.services_changed(added, gone)
+
+
+def _tells_type(header: Any) -> bool:
+    return isinstance(header, dict) and bool(header.get("type"))
+
+
+def _look_up(master: Master, services: Sequence[str]) -> Dict[str, str]:
+    """Where services are, but for those that have just gone; blocking. Raises MasterUnreachable."""
+    uris = {}
+    for service in services:
+        try:
+            uris[service] = str(master.call("lookupService", service))
+        except MasterError as error:
+            logger.debug("%s", error)
+    return uris
+
+
+def _load(names: Sequence[str]) -> Dict[str, ServiceType]:
+    """Those of these types that are installed; blocking."""
+    types = {}
+    for name in names:
+        try:
+            types[name] = get_service_type(name)
+        except RosbridgeError as error:
+            logger.debug("services of type %s are left out: %s", name, error)
+    return types
+
+
+class ServiceCalls(Capability):
+    """What services one client is offered, and its calls."""
+
+    protocol: FoxgloveProtocol
+
+    def __init__(self, protocol: FoxgloveProtocol) -> None:
+        super().__init__(protocol)
+        self._offered: Dict[int, OfferedService] = {}
+        protocol.register_operation(messages.SERVICE_CALL, self.call)
+        protocol.server.services.add(self)
+
+    def services_changed(self, added: Sequence[OfferedService], removed: Sequence[OfferedService]) -> None:
+        """`removed` are gone, then `added` are there."""
+        if removed:
+            self.protocol.send({"op": "unadvertiseServices", "serviceIds": [service.id for service in removed]})
+        for service in removed:
+            self._offered.pop(service.id, None)
+        self._offered.update({service.id: service for service in added})
+        if added:
+            self.protocol.send({"op": "advertiseServices", "services": [each.advertisement() for each in added]})
+
+    def call(self, message: Operation) -> None:
+        """Begin a call. It gets exactly one answer."""
+        self.protocol.spawn(self._call(message), message)
+
+    async def _call(self, message: Operation) -> None:
+        service_id, call_id = message["serviceId"], message["callId"]
+        try:
+            response = await self._response(service_id, message["encoding"], message["payload"])
+        except RosbridgeError as error:
+            self.protocol.send(messages.service_call_failure(service_id, call_id, str(error)))
+        except Exception as error:  # a bug here must not leave the client waiting; it is reported whole by the caller
+            reason = f"internal error ({type(error).__name__})"
+            self.protocol.send(messages.service_call_failure(service_id, call_id, reason))
+            raise
+        else:
+            payload = messages.service_response(service_id, call_id, message["encoding"], response)
+            self.protocol.send_payload(payload)
+
+    async def _response(self, service_id: int, encoding: str, payload: bytes) -> bytes:
+        service = self._offered.get(service_id)
+        if service is None:
+            raise InvalidArgumentException(f"there is no service {service_id}")
+        if encoding not in messages.ENCODINGS:
+            known = ", ".join(messages.ENCODINGS)
+            raise InvalidArgumentException(f"the encoding must be one of {known}, not '{encoding[:100]}'")
+        node, name = self.protocol.node, service.name
+        if not self.protocol.server.services.may_see(name):
+            raise AccessDenied(f"the server does not let clients call {name}")
+        timeout_s = self.protocol.parameters.default_call_service_timeout
+        if encoding == "ros1":
+            reply = await node.services.call(name, payload, None, timeout_s, now=node.now)
+            return reply.wire
+        values = decode_json(payload)
+        if not isinstance(values, dict):
+            raise InvalidArgumentException(f"a request in JSON must be an object, not {type(values).__name__}")
+        reply = await node.services.call(name, values, None, timeout_s, now=node.now)
+        return reply.type.to_json(reply.wire)
+
+    def finish(self) -> None:
+        self.protocol.server.services.remove(self)
