@@ -14,6 +14,7 @@ import asyncio
 import dataclasses
 import errno
 import logging
+import socket
 import ssl
 from typing import TYPE_CHECKING, Any, Awaitable, Callable, Dict, List, Mapping, Optional, Protocol, Union
 
@@ -22,6 +23,7 @@ from tornado.netutil import bind_sockets
 from tornado.web import Application, RequestHandler
 from tornado.websocket import WebSocketHandler, WebSocketProtocol
 
+from rosbridge_library.foxglove.messages import SUBPROTOCOLS
 from rosbridge_library.payload import Outbox
 from rosbridge_server.connection import WebSocketConnection
 from rosbridge_server.outbox import ClientOutbox
@@ -90,17 +92,25 @@ class WebSocketServer:
         )
 
     async def listen(self) -> None:
-        """Listens on the address and port, and tries again every ``retry_startup_delay`` while they are held.
+        """Listens on the address and port, and on foxglove_port if there is one; tries again every
+        ``retry_startup_delay`` while they are held.
 
         Raises ListenError when the reason won't go away by itself.
         """
         settings = self.settings
+        sockets = await self._bind(settings.port)
+        self.port = sockets[0].getsockname()[1]
+        if settings.foxglove_port and settings.foxglove_port != self.port:
+            sockets += await self._bind(settings.foxglove_port)
+        self._http.add_sockets(sockets)
+
+    async def _bind(self, port: int) -> List[socket.socket]:
+        settings = self.settings
         while True:
             try:
-                sockets = bind_sockets(settings.port, settings.address or None, backlog=_BACKLOG)
-                break
+                return bind_sockets(port, settings.address or None, backlog=_BACKLOG)
             except OSError as error:
-                where = f"{settings.address or 'all interfaces'}, port {settings.port}"
+                where = f"{settings.address or 'all interfaces'}, port {port}"
                 if error.errno in (errno.EACCES, errno.EPERM):
                     raise ListenError(f"may not listen on {where}: {error.strerror}") from error
                 logger.warning(
@@ -110,8 +120,6 @@ class WebSocketServer:
                     settings.retry_startup_delay,
                 )
                 await asyncio.sleep(max(settings.retry_startup_delay, 0.01))
-        self.port = sockets[0].getsockname()[1]
-        self._http.add_sockets(sockets)
 
     @property
     def url(self) -> str:
@@ -131,6 +139,11 @@ class WebSocketServer:
         return self._http.close_all_connections()
 
     # For the handlers
+
+    def burst_bytes(self, subprotocol: Optional[str]) -> int:
+        """What may wait for a client of this subprotocol before messages are dropped."""
+        limit = self.settings.send_buffer_limit if subprotocol in SUBPROTOCOLS else None
+        return self.settings.burst_bytes if limit is None else limit
 
     def next_client_id(self, address: str, port: int) -> str:
         """An id that no other client ever has, telling where it connects from."""
@@ -219,7 +232,7 @@ class ClientHandler(WebSocketHandler):
         outbox = ClientOutbox(
             StreamTransport(connection.stream, connection.frame, self._drained, self._give_up),
             asyncio.get_event_loop().call_later,
-            burst_bytes=server.settings.burst_bytes,
+            burst_bytes=server.burst_bytes(self.selected_subprotocol),
             max_bytes=server.settings.max_client_bytes,
             delay_between_messages=server.settings.delay_between_messages,
             stall_timeout=server.settings.stall_timeout,

@@ -12,8 +12,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from dataclasses import dataclass
-from typing import Any, Callable, Dict, Mapping, Optional, Sequence, Type, TypeVar
+from typing import Any, Callable, Dict, Mapping, Optional, Sequence, Tuple, Type, TypeVar
+
+import yaml
+
+from rosbridge_library.foxglove.options import CAPABILITIES, Options
 
 MEBIBYTE = 1 << 20
 
@@ -77,6 +82,39 @@ def _choice(*names: str) -> Callable[[Any], str]:
     return read
 
 
+def _texts(value: Any) -> Tuple[str, ...]:
+    """Several strings: a list, as a launch file's <rosparam> has it, the same as YAML text, or one string."""
+    listed = value
+    if isinstance(value, str):
+        try:
+            listed = yaml.safe_load(value)
+        except yaml.YAMLError:  # a regular expression need not be YAML
+            listed = value
+    if isinstance(listed, (list, tuple)):
+        return tuple(str(item) for item in listed)
+    return (str(value),) if str(value).strip() else ()
+
+
+def _patterns(value: Any) -> Tuple[str, ...]:
+    patterns = _texts(value)
+    for pattern in patterns:
+        try:
+            re.compile(pattern)
+        except re.error as error:
+            raise ValueError(f"{pattern}: {error}") from error
+    return patterns
+
+
+def _names(*known: str) -> Callable[[Any], Tuple[str, ...]]:
+    def read(value: Any) -> Tuple[str, ...]:
+        names = _texts(value)
+        if not set(names) <= set(known):
+            raise ValueError(value)
+        return names
+
+    return read
+
+
 def _or_none(kind: Kind) -> Kind:
     def read(value: Any) -> Any:
         return None if str(value).strip().lower() in ("none", "") else kind.read(value)
@@ -89,6 +127,9 @@ SECONDS = Kind(_seconds, "a number of seconds, 0 or more")
 TEXT = Kind(_text, "a string")
 BYTES = Kind(_integer(1), "a number of bytes, 1 or more")
 BYTES_OR_0 = Kind(_integer(0), "a number of bytes, 0 for no limit")
+MILLISECONDS = Kind(_integer(1), "a number of milliseconds, 1 or more")
+PATTERNS = Kind(_patterns, "a list of regular expressions")
+FOXGLOVE_CAPABILITIES = Kind(_names(*CAPABILITIES), f"a list of some of {', '.join(CAPABILITIES)}")
 PORT = Kind(_integer(1, 65535), "a port from 1 to 65535")
 PORT_OR_0 = Kind(_integer(0, 65535), "a port from 0 to 65535")
 
@@ -137,6 +178,35 @@ class Settings:
     max_client_bytes: int = setting(64 * MEBIBYTE, BYTES, "that may wait for a client at most")
     stall_timeout: float = setting(
         30.0, SECONDS, "until a client that takes nothing while something waits for it is closed; 0 for never"
+    )
+
+    foxglove_port: Optional[int] = setting(
+        None, _or_none(Kind(_integer(0, 65535), "a port from 1 to 65535, 0 for none")), "a second port to listen on"
+    )
+    topic_whitelist: Tuple[str, ...] = setting(Options.topic_whitelist, PATTERNS, "topics that Foxglove clients see")
+    service_whitelist: Tuple[str, ...] = setting(
+        Options.service_whitelist, PATTERNS, "services that Foxglove clients see and may call"
+    )
+    param_whitelist: Tuple[str, ...] = setting(
+        Options.param_whitelist, PATTERNS, "parameters that Foxglove clients may use"
+    )
+    client_topic_whitelist: Tuple[str, ...] = setting(
+        Options.client_topic_whitelist, PATTERNS, "topics that Foxglove clients may publish"
+    )
+    capabilities: Tuple[str, ...] = setting(
+        Options.capabilities, FOXGLOVE_CAPABILITIES, "what Foxglove clients are offered beside topics"
+    )
+    asset_uri_allowlist: Tuple[str, ...] = setting(
+        Options.asset_uri_allowlist, PATTERNS, "URIs of files that Foxglove clients may fetch"
+    )
+    send_buffer_limit: Optional[int] = setting(
+        None, _or_none(BYTES_OR_0), "burst_bytes of Foxglove clients, if another one"
+    )
+    max_update_ms: int = setting(
+        Options.max_update_ms, MILLISECONDS, "between two looks at topics and services, for Foxglove clients"
+    )
+    service_type_retrieval_timeout_ms: int = setting(
+        Options.service_type_retrieval_timeout_ms, MILLISECONDS, "that a node may take to tell a service's type"
     )
 
 

@@ -9,6 +9,7 @@ exit code is 0 when it was told to end, 1 when it can't serve, 2 for a command l
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import gc
 import logging
 import os
@@ -16,11 +17,12 @@ import resource
 import signal
 import sys
 import threading
-from typing import TYPE_CHECKING, Any, List, Mapping, Optional, Set
+from typing import TYPE_CHECKING, Any, Dict, List, Mapping, Optional, Set
 
 from rosbridge_server.settings import Settings, SettingsError, help_text, load, read_flags, usage
 
 if TYPE_CHECKING:
+    from rosbridge_library.payload import Outbox
     from rosbridge_library.ros.node import Node
     from rosbridge_server.server import WebSocketServer
 
@@ -67,6 +69,7 @@ def _run(flags: Mapping[str, Any]) -> int:
     import rospy
 
     # All that is needed, so that a package which is missing is told at once, and not when a master has come.
+    import rosbridge_library.foxglove.server
     import rosbridge_library.rosbridge_protocol  # noqa: F401
     import rosbridge_server.clients
     import rosbridge_server.server  # noqa: F401
@@ -150,9 +153,12 @@ async def _serve(settings: Settings) -> int:
 async def _start(settings: Settings, node: Node) -> WebSocketServer:
     import rospy
 
+    from rosbridge_library.foxglove.messages import SUBPROTOCOLS
+    from rosbridge_library.foxglove.options import Options
+    from rosbridge_library.foxglove.server import FoxgloveServer
     from rosbridge_library.rosbridge_protocol import RosbridgeProtocol
     from rosbridge_server.clients import Clients
-    from rosbridge_server.server import WebSocketServer
+    from rosbridge_server.server import ProtocolFactory, WebSocketServer
 
     await node.start()
     # What is loaded by now stays, and JSON of large arrays of messages makes thousands of objects that die together:
@@ -160,15 +166,14 @@ async def _start(settings: Settings, node: Node) -> WebSocketServer:
     gc.freeze()
     gc.set_threshold(_GC_THRESHOLD)
     clients = await node.call(Clients, node.now)
-    server = WebSocketServer(
-        settings,
-        {
-            None: lambda client_id, parameters, outbox: RosbridgeProtocol(
-                client_id, parameters=parameters, node=node, outbox=outbox
-            )
-        },
-        clients,
-    )
+    foxglove = FoxgloveServer(node, Options.from_mapping(dataclasses.asdict(settings)))
+    await foxglove.start()
+
+    def rosbridge(client_id: str, parameters: Mapping[str, Any], outbox: Outbox) -> RosbridgeProtocol:
+        return RosbridgeProtocol(client_id, parameters=parameters, node=node, outbox=outbox)
+
+    protocols: Dict[Optional[str], ProtocolFactory] = dict.fromkeys(SUBPROTOCOLS, foxglove.protocol)
+    server = WebSocketServer(settings, {None: rosbridge, **protocols}, clients)
     await server.listen()
     await node.call(rospy.set_param, "~actual_port", server.port)
     logger.info("Rosbridge WebSocket server started at %s", server.url)

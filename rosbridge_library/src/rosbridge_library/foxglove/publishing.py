@@ -75,7 +75,9 @@ class Publishing(Capability):
         channel_id, topic = number(entry, "id"), text(entry, "topic")
         encoding, type_name = text(entry, "encoding"), text(entry, "schemaName")
         if channel_id in self._channels:
-            raise InvalidArgumentException(f"the channel id {channel_id} is in use for {self._channels[channel_id].topic}")
+            raise InvalidArgumentException(
+                f"the channel id {channel_id} is in use for {self._channels[channel_id].topic}"
+            )
         if encoding not in messages.ENCODINGS:
             raise InvalidArgumentException(f"the field 'encoding' must be one of {', '.join(messages.ENCODINGS)}")
         if not matches(self.protocol.server.options.client_topic_whitelist, global_name(topic)):

@@ -100,8 +100,8 @@ class Services:
     async def _learn(self, names: Sequence[str], provided: Dict[str, List[str]]) -> None:
         uris = await self._node.call(_look_up, self._node.master, names)
         headers = await probe_services(uris, self._node.caller_id, self._timeout_s)
-        type_names = {name: header["type"] for name, header in headers.items() if _tells_type(header)}
-        types = await self._node.call(_load, sorted(set(type_names.values())))
+        type_names = {name: header.get("type", "") for name, header in headers.items() if isinstance(header, dict)}
+        types = await self._node.call(_load, sorted(set(type_names.values()) - {""}))
         added = []
         for name in names:
             type_ = types.get(type_names.get(name, ""))
@@ -121,10 +121,6 @@ class Services:
         if added or gone:
             for audience in list(self._audiences):
                 audience.services_changed(added, gone)
-
-
-def _tells_type(header: Any) -> bool:
-    return isinstance(header, dict) and bool(header.get("type"))
 
 
 def _look_up(master: Master, services: Sequence[str]) -> Dict[str, str]:

@@ -96,7 +96,7 @@ class _TellingCache(rospy.impl.paramserver.ParamServerCache):  # type: ignore[mi
 
     def __init__(self, loop: asyncio.AbstractEventLoop, updated: Listener) -> None:
         super().__init__()
-        self._tell = functools.partial(loop.call_soon_threadsafe, updated)
+        self._tell: Callable[[str, Any], object] = functools.partial(loop.call_soon_threadsafe, updated)  # type: ignore[arg-type]
 
     def update(self, key: str, value: Any) -> None:
         with contextlib.suppress(RuntimeError):  # the loop is closed: nobody is left to tell
