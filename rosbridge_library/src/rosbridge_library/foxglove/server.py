@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import logging
 import os
+import uuid
 from typing import Any, Callable, Dict, List, Mapping, Optional, Set, Union
 
 from rosbridge_library.capability import Capability
@@ -71,9 +72,8 @@ class FoxgloveServer:
         self._generation = self.node.master_generation
         distribution = os.environ.get("ROS_DISTRO") or await self._param("/rosdistro") or DEFAULT_DISTRIBUTION
         self._metadata = {"ROS_DISTRO": str(distribution).strip()}
-        # Every start of a ROS system has an id; a master that was started by itself has none.
-        run_id = await self._param("/run_id")
-        self._session_id = None if run_id is None else str(run_id)
+        # roslaunch gives every start of a ROS system an id; a master that was started by itself has none.
+        self._session_id = str(await self._param("/run_id") or uuid.uuid4())
 
     async def _param(self, name: str) -> Any:
         try:
