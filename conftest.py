@@ -36,7 +36,9 @@ from support import bridge as bridges  # noqa: E402
 from support import process as processes  # noqa: E402
 from support.bridge import Bridge  # noqa: E402
 from support.client import Client  # noqa: E402
+from support.foxglove import Foxglove  # noqa: E402
 from support.node import Node  # noqa: E402
+from support.peer import Peer  # noqa: E402
 from support.ros import RosMaster  # noqa: E402
 
 
@@ -103,6 +105,34 @@ def connect() -> Iterator[Callable[..., Client]]:
     yield new
     for client in clients:
         client.close()
+
+
+@pytest.fixture
+def connect_foxglove() -> Iterator[Callable[..., Foxglove]]:
+    """`connect_foxglove(bridge, …)`: a new Foxglove client of that server, closed when the test ends."""
+    clients: List[Foxglove] = []
+
+    def new(server: Bridge, **options: Any) -> Foxglove:
+        clients.append(Foxglove(server.url, **options))
+        return clients[-1]
+
+    yield new
+    for client in clients:
+        client.close()
+
+
+@pytest.fixture
+def foxglove(bridge: Bridge, connect_foxglove: Callable[..., Foxglove]) -> Foxglove:
+    """A Foxglove client of the module's server."""
+    return connect_foxglove(bridge)
+
+
+@pytest.fixture(scope="module")
+def peer(ros_master: RosMaster) -> Iterator[Peer]:
+    """A node that the tests of this module command."""
+    node = Peer(ros_master)
+    yield node
+    node.node.stop()
 
 
 @pytest.fixture

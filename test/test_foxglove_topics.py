@@ -7,7 +7,7 @@ import contextlib
 import socket
 import struct
 import time
-from typing import Any, Callable, Iterator, List
+from typing import Any, Callable, List
 
 import pytest
 from genpy import Time
@@ -38,34 +38,9 @@ ready()
 WITHIN_S = 1.5  # a look at the graph every second, and what it takes to tell of it
 
 
-@pytest.fixture(scope="module")
-def peer(ros_master: RosMaster) -> Iterator[Peer]:
-    node = Peer(ros_master)
-    yield node
-    node.node.stop()
-
-
-@pytest.fixture
-def foxglove() -> Iterator[Callable[..., Foxglove]]:
-    clients: List[Foxglove] = []
-
-    def new(server: Bridge, **options: Any) -> Foxglove:
-        clients.append(Foxglove(server.url, **options))
-        return clients[-1]
-
-    yield new
-    for client in clients:
-        client.close()
-
-
-@pytest.fixture
-def client(bridge: Bridge, foxglove: Callable[..., Foxglove]) -> Foxglove:
-    return foxglove(bridge)
-
-
-def test_the_first_message_is_server_info_and_an_advertise_follows(client: Foxglove) -> None:
-    client.wait(lambda: client.told("advertise"), "an advertise")
-    info = client.messages[0]
+def test_the_first_message_is_server_info_and_an_advertise_follows(foxglove: Foxglove) -> None:
+    foxglove.wait(lambda: foxglove.told("advertise"), "an advertise")
+    info = foxglove.messages[0]
     assert info["op"] == "serverInfo"
     assert info["capabilities"] == CAPABILITIES
     assert info["supportedEncodings"] == ["ros1", "json"]
@@ -75,13 +50,13 @@ def test_the_first_message_is_server_info_and_an_advertise_follows(client: Foxgl
 
 
 def test_the_session_is_the_run_of_the_master(
-    ros_master: RosMaster, start_bridge: Callable[..., Bridge], foxglove: Callable[..., Foxglove]
+    ros_master: RosMaster, start_bridge: Callable[..., Bridge], connect_foxglove: Callable[..., Foxglove]
 ) -> None:
     ros_master.set_param("/run_id", "the run")
     try:
         server = start_bridge(name="with_run_id")
         for _ in range(2):
-            found = foxglove(server)
+            found = connect_foxglove(server)
             found.wait(lambda found=found: found.messages, "serverInfo")
             assert found.messages[0]["sessionId"] == "the run"
     finally:
@@ -98,25 +73,27 @@ def test_the_session_is_the_run_of_the_master(
     ],
 )
 def test_the_subprotocol_is_the_first_one_offered_that_is_known(
-    bridge: Bridge, foxglove: Callable[..., Foxglove], offered: List[str], selected: str
+    bridge: Bridge, connect_foxglove: Callable[..., Foxglove], offered: List[str], selected: str
 ) -> None:
-    found = foxglove(bridge, subprotocols=offered)
+    found = connect_foxglove(bridge, subprotocols=offered)
     assert found.subprotocol == selected
     found.wait(lambda: found.told("serverInfo"), "serverInfo")
 
 
 def test_a_second_port(
-    ros_master: RosMaster, start_bridge: Callable[..., Bridge], foxglove: Callable[..., Foxglove]
+    ros_master: RosMaster, start_bridge: Callable[..., Bridge], connect_foxglove: Callable[..., Foxglove]
 ) -> None:
     port = free_port()
     server = start_bridge({"foxglove_port": port}, name="with_two_ports")
     with Foxglove(f"ws://127.0.0.1:{port}") as on_second:
         on_second.wait(lambda: on_second.told("serverInfo"), "serverInfo")
-    foxglove(server).channel("/rosout")
+    connect_foxglove(server).channel("/rosout")
 
 
-def test_the_server_can_offer_less(start_bridge: Callable[..., Bridge], foxglove: Callable[..., Foxglove]) -> None:
-    found = foxglove(start_bridge({"capabilities": ["connectionGraph"]}, name="with_less"))
+def test_the_server_can_offer_less(
+    start_bridge: Callable[..., Bridge], connect_foxglove: Callable[..., Foxglove]
+) -> None:
+    found = connect_foxglove(start_bridge({"capabilities": ["connectionGraph"]}, name="with_less"))
     found.channel("/rosout")
     info = found.messages[0]
     assert info["capabilities"] == ["connectionGraph"]
@@ -132,10 +109,10 @@ def test_the_server_can_offer_less(start_bridge: Callable[..., Bridge], foxglove
     assert not found.told("advertiseServices")
 
 
-def test_a_channel_tells_all_that_a_message_needs(client: Foxglove, peer: Peer) -> None:
+def test_a_channel_tells_all_that_a_message_needs(foxglove: Foxglove, peer: Peer) -> None:
     topic = "/channels/odometry"
     peer.advertise(topic, "nav_msgs/Odometry")
-    channel = client.channel(topic, WITHIN_S)
+    channel = foxglove.channel(topic, WITHIN_S)
     assert set(channel) == {"id", "topic", "encoding", "schemaName", "schema", "schemaEncoding"}
     assert (channel["encoding"], channel["schemaName"], channel["schemaEncoding"]) == (
         "ros1",
@@ -143,78 +120,78 @@ def test_a_channel_tells_all_that_a_message_needs(client: Foxglove, peer: Peer) 
         "ros1msg",
     )
     assert "MSG: geometry_msgs/PoseWithCovariance" in channel["schema"]
-    subscription = client.subscribe(topic)
+    subscription = foxglove.subscribe(topic)
     peer.wait_connected(topic)
     before = time.time_ns()
     peer.publish(topic, {"child_frame_id": "base", "pose": {"pose": {"position": {"x": 1.5}}}})
-    (message,) = client.wait_messages(subscription)
+    (message,) = foxglove.wait_messages(subscription)
     odometry = decoded(channel, message.data)
     assert (odometry.child_frame_id, odometry.pose.pose.position.x) == ("base", 1.5)
     assert before <= message.time_ns <= time.time_ns()
     peer.unadvertise(topic)
 
 
-def test_a_type_that_is_not_installed_is_learnt_from_the_publisher(client: Foxglove, peer: Peer) -> None:
+def test_a_type_that_is_not_installed_is_learnt_from_the_publisher(foxglove: Foxglove, peer: Peer) -> None:
     topic = "/channels/not_installed"
     peer.advertise(topic, "not_installed/Outer", definition=NESTED, latch=True)
-    channel = client.channel(topic, WITHIN_S)
+    channel = foxglove.channel(topic, WITHIN_S)
     assert channel["schemaName"] == "not_installed/Outer"
     peer.publish(topic, {"points": [{"x": 2.5}], "name": "it"})
-    (message,) = client.wait_messages(client.subscribe(topic))
+    (message,) = foxglove.wait_messages(foxglove.subscribe(topic))
     assert decoded(channel, message.data).points[0].x == 2.5
     peer.unadvertise(topic)
-    client.wait(lambda: channel["id"] not in client.channels, "its end")
+    foxglove.wait(lambda: channel["id"] not in foxglove.channels, "its end")
 
 
-def test_channels_come_and_go_within_a_second_and_keep_their_ids(client: Foxglove, peer: Peer) -> None:
+def test_channels_come_and_go_within_a_second_and_keep_their_ids(foxglove: Foxglove, peer: Peer) -> None:
     topic = "/channels/coming"
-    client.channel("/rosout")
+    foxglove.channel("/rosout")
     ids = []
     for kind in ("std_msgs/String", "std_msgs/Int32", "std_msgs/String"):
         peer.advertise(topic, kind)
-        channel = client.channel(topic, WITHIN_S)
+        channel = foxglove.channel(topic, WITHIN_S)
         assert channel["schemaName"] == kind
         ids.append(channel["id"])
         peer.unadvertise(topic)
-        client.wait(lambda number=channel["id"]: number not in client.channels, "its end", WITHIN_S)
+        foxglove.wait(lambda number=channel["id"]: number not in foxglove.channels, "its end", WITHIN_S)
     assert ids[0] == ids[2] != ids[1]
 
 
-def test_another_type_at_once_is_another_channel(client: Foxglove, peer: Peer) -> None:
+def test_another_type_at_once_is_another_channel(foxglove: Foxglove, peer: Peer) -> None:
     topic = "/channels/changing"
     peer.advertise(topic, "std_msgs/String")
-    first = client.channel(topic)
-    client.subscribe(topic)
+    first = foxglove.channel(topic)
+    foxglove.subscribe(topic)
     peer.unadvertise(topic)
     peer.advertise(topic, "std_msgs/Int32", latch=True)
-    client.wait(lambda: client.channel(topic)["schemaName"] == "std_msgs/Int32", "the other type", WITHIN_S)
-    assert first["id"] not in client.channels
+    foxglove.wait(lambda: foxglove.channel(topic)["schemaName"] == "std_msgs/Int32", "the other type", WITHIN_S)
+    assert first["id"] not in foxglove.channels
     peer.publish(topic, {"data": 7})
-    (message,) = client.wait_messages(client.subscribe(topic))
+    (message,) = foxglove.wait_messages(foxglove.subscribe(topic))
     assert message.data == struct.pack("<i", 7)
     peer.unadvertise(topic)
 
 
-def test_another_version_of_an_installed_type_replaces_the_channel(client: Foxglove, peer: Peer) -> None:
+def test_another_version_of_an_installed_type_replaces_the_channel(foxglove: Foxglove, peer: Peer) -> None:
     topic = "/channels/version"
     peer.advertise(topic, "std_msgs/String", definition="string data\nint32 more\n", latch=True)
     peer.publish(topic, {"data": "it", "more": 3})
-    installed = client.channel(topic)
-    client.subscribe(topic)
-    client.wait(lambda: installed["id"] not in client.channels, "the end of the installed version's channel")
-    channel = client.channel(topic)
-    (message,) = client.wait_messages(client.subscribe(topic))
+    installed = foxglove.channel(topic)
+    foxglove.subscribe(topic)
+    foxglove.wait(lambda: installed["id"] not in foxglove.channels, "the end of the installed version's channel")
+    channel = foxglove.channel(topic)
+    (message,) = foxglove.wait_messages(foxglove.subscribe(topic))
     assert decoded(channel, message.data).more == 3
-    assert not client.shown
+    assert not foxglove.shown
     peer.unadvertise(topic)
 
 
 def test_a_topic_whose_type_cannot_be_learnt_is_told_until_it_is_gone(
-    client: Foxglove, ros_master: RosMaster, bridge: Bridge
+    foxglove: Foxglove, ros_master: RosMaster, bridge: Bridge
 ) -> None:
     topic, node = "/channels/unknown", "http://127.0.0.1:1/"
     ros_master.call("registerPublisher", topic, "not_installed/Nothing", node)
-    status = client.wait_status(topic)
+    status = foxglove.wait_status(topic)
     assert (status["level"], status["id"]) == (1, f"topic:{topic}")
     late = Foxglove(bridge.url)
     try:
@@ -222,12 +199,12 @@ def test_a_topic_whose_type_cannot_be_learnt_is_told_until_it_is_gone(
     finally:
         late.close()
     ros_master.call("unregisterPublisher", topic, node)
-    client.wait(lambda: not client.shown, "its withdrawal")
-    assert client.told("removeStatus")[-1]["statusIds"] == [f"topic:{topic}"]
+    foxglove.wait(lambda: not foxglove.shown, "its withdrawal")
+    assert foxglove.told("removeStatus")[-1]["statusIds"] == [f"topic:{topic}"]
 
 
 def test_latched_messages_of_every_publisher_reach_every_late_subscriber(
-    client: Foxglove,
+    foxglove: Foxglove,
     bridge: Bridge,
     ros_master: RosMaster,
     nodes: Callable[[Node], Node],
@@ -245,7 +222,7 @@ def test_latched_messages_of_every_publisher_reach_every_late_subscriber(
     def latched(subscription: int, of: Foxglove) -> bool:
         return {message.data for message in of.wait_messages(subscription, 2)} == expected
 
-    assert latched(client.subscribe(topic), client)
+    assert latched(foxglove.subscribe(topic), foxglove)
     other = connect(bridge)  # one that speaks rosbridge, on the same feed
     other.send({"op": "subscribe", "topic": topic})
     assert {other.wait_for(op="publish")["msg"]["data"] for _ in range(2)} == {"first", "second"}
@@ -257,19 +234,19 @@ def test_latched_messages_of_every_publisher_reach_every_late_subscriber(
             again = late.subscribe(topic)
             assert latched(again, late)
             assert len(late.received[number]) == 2
-    assert all(len(messages) == 2 for messages in client.received.values())
+    assert all(len(messages) == 2 for messages in foxglove.received.values())
 
 
 def serialized_string(text: str) -> bytes:
     return struct.pack("<I", len(text)) + text.encode()
 
 
-def test_one_feed_serves_all(client: Foxglove, bridge: Bridge, peer: Peer, connect: Callable[..., Client]) -> None:
+def test_one_feed_serves_all(foxglove: Foxglove, bridge: Bridge, peer: Peer, connect: Callable[..., Client]) -> None:
     topic = "/channels/shared"
     peer.advertise(topic, "std_msgs/Int32")
     others = [Foxglove(bridge.url) for _ in range(3)]
     try:
-        subscriptions = [(each, each.subscribe(topic)) for each in (client, *others)]
+        subscriptions = [(each, each.subscribe(topic)) for each in (foxglove, *others)]
         plain = connect(bridge)
         plain.send({"op": "subscribe", "topic": topic})
         peer.wait_connected(topic)
@@ -288,12 +265,12 @@ def test_one_feed_serves_all(client: Foxglove, bridge: Bridge, peer: Peer, conne
     peer.unadvertise(topic)
 
 
-def test_mistakes_with_subscriptions_are_told_and_hinder_nothing_else(client: Foxglove, peer: Peer) -> None:
+def test_mistakes_with_subscriptions_are_told_and_hinder_nothing_else(foxglove: Foxglove, peer: Peer) -> None:
     topic, other = "/channels/mistakes", "/channels/mistakes_too"
     peer.advertise(topic, "std_msgs/Int32")
     peer.advertise(other, "std_msgs/Int32")
-    channel, second = client.channel(topic)["id"], client.channel(other)["id"]
-    client.send(
+    channel, second = foxglove.channel(topic)["id"], foxglove.channel(other)["id"]
+    foxglove.send(
         "subscribe",
         subscriptions=[
             {"id": 900, "channelId": 123456},
@@ -306,10 +283,10 @@ def test_mistakes_with_subscriptions_are_told_and_hinder_nothing_else(client: Fo
             {"id": 903, "channelId": second},
         ],
     )
-    client.send("unsubscribe", subscriptionIds=[999])
-    client.wait(lambda: len(client.statuses) >= 7, "seven statuses")
-    texts = [status["message"] for status in client.statuses]
-    assert [status["level"] for status in client.statuses] == [2, 2, 2, 2, 2, 2, 1]
+    foxglove.send("unsubscribe", subscriptionIds=[999])
+    foxglove.wait(lambda: len(foxglove.statuses) >= 7, "seven statuses")
+    texts = [status["message"] for status in foxglove.statuses]
+    assert [status["level"] for status in foxglove.statuses] == [2, 2, 2, 2, 2, 2, 1]
     assert "there is no channel 123456" in texts[0]
     assert "is subscribed to already" in texts[1]
     assert "the subscription id 901 is in use" in texts[2]
@@ -319,12 +296,12 @@ def test_mistakes_with_subscriptions_are_told_and_hinder_nothing_else(client: Fo
     for each in (topic, other):
         peer.wait_connected(each)
         peer.publish(each, {"data": 1})
-    client.wait_messages(901)
-    client.wait_messages(903)
-    client.send("unsubscribe", subscriptionIds=[901])
-    client.send("subscribe", subscriptions=[{"id": 901, "channelId": channel}])  # the id is free again
-    client.wait(lambda: peer.command("connections", topic=topic) == 1, "the new subscription")
-    assert len(client.statuses) == 7
+    foxglove.wait_messages(901)
+    foxglove.wait_messages(903)
+    foxglove.send("unsubscribe", subscriptionIds=[901])
+    foxglove.send("subscribe", subscriptions=[{"id": 901, "channelId": channel}])  # the id is free again
+    foxglove.wait(lambda: peer.command("connections", topic=topic) == 1, "the new subscription")
+    assert len(foxglove.statuses) == 7
     for each in (topic, other):
         peer.unadvertise(each)
 
@@ -348,23 +325,23 @@ def test_mistakes_with_subscriptions_are_told_and_hinder_nothing_else(client: Fo
         (b"\x02\x00\x00", "ends before its ids"),
     ],
 )
-def test_what_is_no_message_of_the_protocol_is_told(client: Foxglove, message: Any, told: str) -> None:
-    client.send_raw(message)
-    client.wait(lambda: client.statuses, "a status")
-    assert client.statuses[0]["level"] == 2
-    assert told.lower() in client.statuses[0]["message"].lower()
-    client.channel("/rosout")  # and the connection goes on
+def test_what_is_no_message_of_the_protocol_is_told(foxglove: Foxglove, message: Any, told: str) -> None:
+    foxglove.send_raw(message)
+    foxglove.wait(lambda: foxglove.statuses, "a status")
+    assert foxglove.statuses[0]["level"] == 2
+    assert told.lower() in foxglove.statuses[0]["message"].lower()
+    foxglove.channel("/rosout")  # and the connection goes on
 
 
 def test_whitelists_and_globs_close_topics(
-    start_bridge: Callable[..., Bridge], foxglove: Callable[..., Foxglove], peer: Peer
+    start_bridge: Callable[..., Bridge], connect_foxglove: Callable[..., Foxglove], peer: Peer
 ) -> None:
     for topic in ("/open/a", "/open/secret", "/closed/a", "/open/ab"):
         peer.advertise(topic, "std_msgs/Int32")
     server = start_bridge(
         {"topics_glob": "[/open/*]", "topic_whitelist": ["/open/.", "/open/secre", "/closed/a"]}, name="with_whitelist"
     )
-    client = foxglove(server)
+    client = connect_foxglove(server)
     client.wait(lambda: client.told("advertise"), "an advertise")
     assert {channel["topic"] for channel in client.channels.values()} == {"/open/a"}
     client.send("subscribeConnectionGraph")
@@ -375,20 +352,20 @@ def test_whitelists_and_globs_close_topics(
 
 
 def test_a_slow_client_loses_old_messages_of_its_own_and_is_told(
-    bridge: Bridge, client: Foxglove, ros_master: RosMaster, nodes: Callable[[Node], Node]
+    bridge: Bridge, foxglove: Foxglove, ros_master: RosMaster, nodes: Callable[[Node], Node]
 ) -> None:
     topic, small = "/channels/large", "/channels/small"
     nodes(script(ros_master, LARGE.format(topic=topic), name="large"))
     nodes(publish(ros_master, small, "std_msgs/Int32", rate=20, counter="data", name="small"))
-    subscription = client.subscribe(topic)
-    state = client.subscribe(small)
-    with SlowFoxglove(bridge.port, [client.channel(topic)["id"], client.channel(small)["id"]]) as slow:
-        client.wait_messages(subscription, 150, 30)
+    subscription = foxglove.subscribe(topic)
+    state = foxglove.subscribe(small)
+    with SlowFoxglove(bridge.port, [foxglove.channel(topic)["id"], foxglove.channel(small)["id"]]) as slow:
+        foxglove.wait_messages(subscription, 150, 30)
         text, counts = slow.catch_up(f"dropped:{topic}")
         assert "dropped" in text
         assert counts[1] >= 1
-        assert counts[0] < len(client.received[subscription])
-    numbers = [struct.unpack("<i", message.data)[0] for message in client.received[state]]
+        assert counts[0] < len(foxglove.received[subscription])
+    numbers = [struct.unpack("<i", message.data)[0] for message in foxglove.received[state]]
     assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
 
 
@@ -435,26 +412,26 @@ class SlowFoxglove:
 
 
 def test_nothing_is_watched_and_nothing_left_behind_without_clients(
-    ros_master: RosMaster, bridge: Bridge, client: Foxglove, peer: Peer
+    ros_master: RosMaster, bridge: Bridge, foxglove: Foxglove, peer: Peer
 ) -> None:
     topic = "/channels/left"
     peer.advertise(topic, "std_msgs/Int32")
-    client.subscribe(topic)
+    foxglove.subscribe(topic)
     peer.wait_connected(topic)
-    client.close()
+    foxglove.close()
     wait_until(lambda: peer.command("connections", topic=topic) == 0, 5.0, "the end of the subscription")
     wait_until(lambda: not ros_master.subscribers(topic), 5.0, "the end of the registration")
     peer.unadvertise(topic)
 
 
 def test_time_is_that_of_the_clock_and_channels_come_while_it_stands_still(
-    ros_master: RosMaster, start_bridge: Callable[..., Bridge], foxglove: Callable[..., Foxglove], peer: Peer
+    ros_master: RosMaster, start_bridge: Callable[..., Bridge], connect_foxglove: Callable[..., Foxglove], peer: Peer
 ) -> None:
     ros_master.set_param("/use_sim_time", True)
     try:
         peer.advertise("/clock", "rosgraph_msgs/Clock")
         server = start_bridge(name="with_sim_time")
-        client = foxglove(server)
+        client = connect_foxglove(server)
         client.wait(lambda: client.messages, "serverInfo")
         assert client.messages[0]["capabilities"] == [*CAPABILITIES, "time"]
         peer.wait_connected("/clock")
@@ -477,10 +454,10 @@ def test_time_is_that_of_the_clock_and_channels_come_while_it_stands_still(
 
 
 def test_a_master_that_restarts_is_followed(
-    ros_master: RosMaster, start_bridge: Callable[..., Bridge], foxglove: Callable[..., Foxglove], nodes: Any
+    ros_master: RosMaster, start_bridge: Callable[..., Bridge], connect_foxglove: Callable[..., Foxglove], nodes: Any
 ) -> None:
     server = start_bridge(name="with_restart")
-    client = foxglove(server)
+    client = connect_foxglove(server)
     client.channel("/rosout")
     ros_master.restart()
     node = nodes(

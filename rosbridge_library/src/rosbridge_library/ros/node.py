@@ -15,7 +15,7 @@ import asyncio
 import functools
 import logging
 import threading
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from typing import Any, Callable, Optional, Tuple, TypeVar
 
 import rospy
@@ -50,6 +50,23 @@ T = TypeVar("T")
 
 class RosTimeout(RosbridgeError):
     """A blocking ROS call didn't end in time."""
+
+
+async def call_blocking(
+    threads: Executor, function: Callable[..., T], args: Tuple[Any, ...], timeout: Optional[float]
+) -> T:
+    """See `Node.call`."""
+    work = asyncio.get_running_loop().run_in_executor(threads, functools.partial(function, *args))
+    try:
+        # Not wait_for: before Python 3.12 it may swallow a cancellation that comes at its end.
+        await asyncio.wait({work}, timeout=timeout)
+        if work.done():
+            return work.result()
+    finally:
+        if not work.cancel() and not work.cancelled():
+            work.exception()  # known now, also when nobody waits for it any more
+    name = getattr(function, "__name__", str(function))
+    raise RosTimeout(f"no answer to {name} within {timeout:g} s")
 
 
 class Node:
@@ -108,12 +125,7 @@ class Node:
         Raises RosTimeout after `timeout` seconds (the thread then goes on by itself, so `function` needs a deadline
         of its own), and whatever `function` raises.
         """
-        work = self.loop.run_in_executor(self._threads, functools.partial(function, *args))
-        try:
-            return await asyncio.wait_for(work, timeout)
-        except asyncio.TimeoutError:
-            name = getattr(function, "__name__", str(function))
-            raise RosTimeout(f"no answer to {name} within {timeout:g} s") from None
+        return await call_blocking(self._threads, function, args, timeout)
 
     async def registered(self, kind: str, name: str) -> None:
         """Wait until the master knows a publisher ("pub") or service ("srv") of this node.
