@@ -38,7 +38,7 @@ def test_it_waits_no_longer_than_it_may() -> None:
 
     async def run() -> None:
         with ThreadPoolExecutor(1) as threads:
-            with pytest.raises(RosTimeout, match="no answer to wait within 0.05 s"):
+            with pytest.raises(RosTimeout, match=r"no answer to wait within 0\.05 s"):
                 await call_blocking(threads, release.wait, (10,), 0.05)
             release.set()
 

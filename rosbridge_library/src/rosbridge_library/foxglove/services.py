@@ -9,7 +9,7 @@ beside each other and beside everything else that a client does.
 from __future__ import annotations
 
 import logging
-from typing import Any, Dict, List, NamedTuple, Optional, Sequence
+from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Tuple
 
 from rosbridge_library.capabilities.publication import AccessDenied
 from rosbridge_library.capability import Capability, Operation
@@ -55,6 +55,7 @@ class Services:
         self._audiences: List[ServiceCalls] = []
         self._ids = Ids()
         self._providers: Dict[str, List[str]] = {}  # those that the type of an offered service was learnt from
+        self._told: Dict[str, Tuple[str, str]] = {}  # service: uri, and the type that it told
         self._retry_at_s: Dict[str, float] = {}
         self._following: Latest[Graph] = Latest(self._follow)
 
@@ -90,6 +91,8 @@ class Services:
         self._change([], gone)
         for name in [name for name in self._retry_at_s if name not in provided]:
             del self._retry_at_s[name]
+        for name in [name for name in self._told if name not in provided]:
+            del self._told[name]
         now_s = self._node.loop.time()
         unknown = sorted(
             name for name in provided if name not in self.offered and self._retry_at_s.get(name, 0.0) <= now_s
@@ -99,19 +102,28 @@ class Services:
 
     async def _learn(self, names: Sequence[str], provided: Dict[str, List[str]]) -> None:
         uris = await self._node.call(_look_up, self._node.master, names)
-        headers = await probe_services(uris, self._node.caller_id, self._timeout_s)
-        type_names = {name: header.get("type", "") for name, header in headers.items() if isinstance(header, dict)}
+        type_names = await self._type_names(uris)
         types = await self._node.call(_load, sorted(set(type_names.values()) - {""}))
         added = []
         for name in names:
             type_ = types.get(type_names.get(name, ""))
             if type_ is None:
                 self._retry_at_s[name] = self._node.loop.time() + RETRY_S
-                logger.debug("%s is left out: %s", name, type_names.get(name, headers.get(name)))
+                logger.debug("%s is left out: its type is %s", name, type_names.get(name, "not known"))
                 continue
             self._providers[name] = provided[name]
             added.append(OfferedService(self._ids.of((name, type_.name, type_.md5sum)), name, type_))
         self._change(added, [])
+
+    async def _type_names(self, uris: Dict[str, str]) -> Dict[str, str]:
+        """The types of services at these uris, as far as they tell; asked once for each uri."""
+        unknown = {name: uri for name, uri in uris.items() if self._told.get(name, ("", ""))[0] != uri}
+        for name, header in (await probe_services(unknown, self._node.caller_id, self._timeout_s)).items():
+            if isinstance(header, dict) and header.get("type"):
+                self._told[name] = (uris[name], header["type"])
+            else:
+                logger.debug("%s does not tell its type: %s", name, header)
+        return {name: self._told[name][1] for name, uri in uris.items() if self._told.get(name, ("", ""))[0] == uri}
 
     def _change(self, added: List[OfferedService], gone: List[OfferedService]) -> None:
         for service in gone:
