@@ -38,7 +38,7 @@ from std_msgs.msg import Float64, Int32, String
 from programs.program import plain, ready, say
 from programs.samples import samples
 
-CLIENTS = ("roslib1", "roslib2", "roslibpy")
+CLIENTS = ("roslib1", "roslib2", "roslibpy", "foxglove")
 STEP_S = 0.02
 COUNT_INTERVAL_S = 0.01
 
