@@ -14,7 +14,9 @@ from pathlib import Path
 from typing import Dict, List
 
 import pytest
+import yaml
 
+from rosbridge_server.settings import Settings, load
 from support.process import Process
 from support.ros import ROOT, RosMaster
 from support.wait import wait_until
@@ -93,6 +95,15 @@ def test_the_python_packages_hold_code_and_messages(setup: Path):
 def test_the_launch_file_starts_both_nodes(setup: Path):
     nodes = _run(_sourced(setup, "roslaunch --nodes rosbridge_server rosbridge_websocket.launch"), setup.parent)
     assert nodes.split() == ["/rosbridge_websocket", "/rosapi"]
+
+
+def test_the_launch_file_of_foxglove_bridge_starts_the_same_server_on_its_port(setup: Path):
+    launch = "rosbridge_server foxglove_bridge.launch"
+    assert _run(_sourced(setup, f"roslaunch --nodes {launch}"), setup.parent).split() == ["/foxglove_bridge"]
+    parameters = yaml.safe_load(_run(_sourced(setup, f"roslaunch --dump-params {launch}"), setup.parent))
+    given = {name[len("/foxglove_bridge/") :]: value for name, value in parameters.items() if "foxglove" in name}
+    assert set(given) > {"topic_whitelist", "asset_uri_allowlist", "max_update_ms", "send_buffer_limit"}
+    assert load(Settings, given, {}) == Settings(port=8765)
 
 
 @pytest.mark.parametrize(

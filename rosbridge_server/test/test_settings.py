@@ -43,6 +43,16 @@ TEXTS = {
     "burst_bytes": ("65536", 65536),
     "max_client_bytes": ("1000000", 1000000),
     "stall_timeout": ("12.5", 12.5),
+    "foxglove_port": ("8765", 8765),
+    "topic_whitelist": ("['/tf', '/camera/.{1,9}']", ("/tf", "/camera/.{1,9}")),
+    "service_whitelist": ("/[ab].*", ("/[ab].*",)),
+    "param_whitelist": ("[]", ()),
+    "client_topic_whitelist": ("[/cmd_vel]", ("/cmd_vel",)),
+    "capabilities": ("[assets, services]", ("assets", "services")),
+    "asset_uri_allowlist": (r"^package://.*\.dae$", (r"^package://.*\.dae$",)),
+    "send_buffer_limit": ("10000000", 10000000),
+    "max_update_ms": ("5000", 5000),
+    "service_type_retrieval_timeout_ms": ("500", 500),
 }
 
 
@@ -117,6 +127,11 @@ def test_none_in_all_its_forms(name: str, nothing: Any) -> None:
     assert getattr(load(Settings, {name: nothing}, {}), name) is None
 
 
+@pytest.mark.parametrize("value", [["/a.*", "/b"], "['/a.*', '/b']", '["/a.*", /b]'])
+def test_a_list_of_expressions_may_be_a_list_or_yaml(value: Any) -> None:
+    assert load(Settings, {"topic_whitelist": value}, {}).topic_whitelist == ("/a.*", "/b")
+
+
 def test_a_glob_list_may_be_a_list() -> None:
     assert load(Settings, {"topics_glob": ["/tf", "/camera/*"]}, {}).topics_glob == "[/tf, /camera/*]"
 
@@ -146,6 +161,15 @@ def test_whole_numbers_of_any_type(number: Any) -> None:
         ("unregister_timeout", "nan", "a number of seconds, 0 or more"),
         ("websocket_ping_timeout", False, "a number of seconds, 0 or more"),
         ("binary_encoder", "base85", "default, b64 or bson"),
+        ("foxglove_port", 70000, "a port from 1 to 65535, 0 for none, or None"),
+        ("topic_whitelist", "*", "a list of regular expressions"),
+        ("topic_whitelist", "['(']", "a list of regular expressions"),
+        ("max_update_ms", 0, "a number of milliseconds, 1 or more"),
+        (
+            "capabilities",
+            "[time]",
+            "a list of some of clientPublish, parameters, parametersSubscribe, services, connectionGraph, assets",
+        ),
     ],
 )
 def test_a_wrong_value_names_itself_and_what_is_expected(name: str, value: Any, expected: str) -> None:

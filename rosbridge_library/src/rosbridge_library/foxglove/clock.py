@@ -19,13 +19,16 @@ _CLOCK = struct.Struct("<II")
 
 
 class Clock(Capability, Sink):
-    """Sends one client every time that /clock tells, or to a slow one the newest."""
+    """Sends one client the time as it is, and every time that /clock tells, or to a slow one the newest."""
 
     topic = "/clock (time)"
     keep = 1
 
     def __init__(self, protocol: FoxgloveProtocol) -> None:
         super().__init__(protocol)
+        secs, nsecs = protocol.node.now()
+        if (secs, nsecs) != (0, 0):  # before the first message of /clock there is no time
+            protocol.send_payload(_time_frame(secs, nsecs))
         self._feed = protocol.node.feeds.open(TOPIC, TYPE)
         self._feed.add(self)
 
@@ -52,5 +55,8 @@ class Clock(Capability, Sink):
 def _encode(message: Message) -> List[Payload]:
     if len(message.wire) != _CLOCK.size:
         return []
-    secs, nsecs = _CLOCK.unpack(message.wire)
-    return [messages.time_frame(secs * 1_000_000_000 + nsecs)]
+    return [_time_frame(*_CLOCK.unpack(message.wire))]
+
+
+def _time_frame(secs: int, nsecs: int) -> Payload:
+    return messages.time_frame(secs * 1_000_000_000 + nsecs)
