@@ -85,6 +85,18 @@ def test_what_a_client_publishes_is_a_channel_for_others(foxglove: Foxglove, bri
         assert foxglove.received[subscription][0].data == data
 
 
+def test_two_clients_with_two_definitions_of_a_type_are_not_mixed(foxglove: Foxglove, bridge: Bridge) -> None:
+    topic = "/published/two_definitions"
+    foxglove.advertise(topic, "not_installed/Custom", schema=CUSTOM)
+    foxglove.channel(topic)
+    with Foxglove(bridge.url) as other:
+        other.advertise(topic, "not_installed/Custom", schema="int32 other\n")
+        other.wait_status("another version of not_installed/Custom")
+        other.advertise(topic, "not_installed/Custom", schema=CUSTOM)
+        other.get_parameters("/rosdistro")
+        assert len(other.statuses) == 1
+
+
 def test_several_channels_of_a_topic(foxglove: Foxglove, peer: Peer) -> None:
     topic = "/published/twice"
     peer.subscribe(topic, "std_msgs/String")
@@ -115,6 +127,7 @@ def test_what_is_no_message_is_not_published_and_told_once(
     topic = "/published/garbage"
     peer.subscribe(topic, "std_msgs/String")
     channel = foxglove.advertise(topic, "std_msgs/String", encoding)
+    peer.wait_publishers(topic)
     for _ in range(3):
         foxglove.publish(channel, data)
     foxglove.publish(channel, serialized(String("sound")) if encoding == "ros1" else b'{"data": "sound"}')

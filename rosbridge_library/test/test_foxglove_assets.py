@@ -139,7 +139,11 @@ def test_only_files_of_a_bounded_size_are_read(share: Path) -> None:
     (robot / "folder.dae").mkdir()
     os.mkfifo(robot / "pipe.dae")
     assert len(assets().read("package://robot/full.dae")) == MAX_BYTES
-    for name, reason in (("over", "1001 bytes are more than 1000"), ("folder", "Is a directory"), ("pipe", "not a file")):
+    for name, reason in (
+        ("over", "1001 bytes are more than 1000"),
+        ("folder", "Is a directory"),
+        ("pipe", "not a file"),
+    ):
         with pytest.raises(AssetError, match=reason):
             assets().read(f"package://robot/{name}.dae")
 

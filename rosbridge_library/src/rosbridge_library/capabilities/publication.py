@@ -75,7 +75,7 @@ class Publications:
             raise AccessDenied(f"the server does not let clients publish {topic}")
         name = self.node.resolve(name)
         info: Optional[TopicInfo] = None
-        type_ = self._type_of_ours(name, type_name, latch)
+        type_ = self._type_of_ours(name, type_name, latch) if definition is None else None
         if type_ is None:
             info = await self._look_up(name, type_name, advertise_id)
             type_ = await self._type(name, type_name, info, definition)
@@ -135,8 +135,11 @@ class Publications:
     ) -> MessageType:
         ours = self.node.publishers.get(name)
         if ours is not None and (ours.users or type_name is None):
-            if type_name is not None and ours.type.name != (await self._given(type_name, definition)).name:
+            given = ours.type if type_name is None else await self._given(type_name, definition)
+            if ours.type.name != given.name:
                 raise TopicConflict(f"{name} is already advertised by clients as {ours.type.name}, not {type_name}")
+            if ours.type.md5sum != given.md5sum:
+                raise TopicConflict(f"{name} is already advertised by clients with another version of {type_name}")
             return ours.type
         present = self.node.publishers.type_in_rospy(name) or ""
         if info is not None and self._used_by_others(info):

@@ -9,6 +9,7 @@ from typing import Deque, Dict, Optional, Sequence
 from rosbridge_library.capability import Capability, Operation
 from rosbridge_library.foxglove import messages
 from rosbridge_library.foxglove.fields import entries, number
+from rosbridge_library.foxglove.offer import Change
 from rosbridge_library.foxglove.protocol import FoxgloveProtocol
 from rosbridge_library.foxglove.topics import Audience, Channel
 from rosbridge_library.internal.exceptions import RosbridgeError
@@ -153,18 +154,16 @@ class Channels(Capability, Audience):
 
     # Audience
 
-    def channels_changed(self, added: Sequence[Channel], removed: Sequence[Channel]) -> None:
-        if removed:
-            self.protocol.send({"op": "unadvertise", "channelIds": [channel.id for channel in removed]})
-        for channel in removed:
+    def channels_changed(self, change: Change) -> None:
+        for channel in change.removed:
             self._offered.pop(channel.id, None)
             stream = self._subscribed.get(channel.id)
             if stream is not None:
                 self._end(stream)
                 self._ended.append(stream.id)
-        self._offered.update({channel.id: channel for channel in added})
-        if added or not removed:
-            self.protocol.send({"op": "advertise", "channels": [channel.advertisement() for channel in added]})
+        for payload in change.payloads:
+            self.protocol.send_payload(payload)
+        self._offered.update({channel.id: channel for channel in change.added})
 
     def trouble_changed(self, topic: str, trouble: Optional[str]) -> None:
         if trouble is None:

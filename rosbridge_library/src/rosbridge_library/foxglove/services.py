@@ -16,9 +16,10 @@ from rosbridge_library.capability import Capability, Operation
 from rosbridge_library.codec import ServiceType, decode_json, get_service_type
 from rosbridge_library.foxglove import messages
 from rosbridge_library.foxglove.latest import Latest
+from rosbridge_library.foxglove.offer import Change, Ids
 from rosbridge_library.foxglove.options import Options, matches
 from rosbridge_library.foxglove.protocol import FoxgloveProtocol
-from rosbridge_library.foxglove.topics import RETRY_S, Ids
+from rosbridge_library.foxglove.topics import RETRY_S
 from rosbridge_library.internal.exceptions import InvalidArgumentException, RosbridgeError
 from rosbridge_library.ros.graph import Graph
 from rosbridge_library.ros.master import Master, MasterError
@@ -54,6 +55,7 @@ class Services:
         self._timeout_s = options.service_type_retrieval_timeout_ms / 1000
         self._audiences: List[ServiceCalls] = []
         self._ids = Ids()
+        self._whole: Optional[Change] = None  # what a new client is told, if that is made already
         self._providers: Dict[str, List[str]] = {}  # those that the type of an offered service was learnt from
         self._told: Dict[str, Tuple[str, str]] = {}  # service: uri, and the type that it told
         self._retry_at_s: Dict[str, float] = {}
@@ -67,7 +69,9 @@ class Services:
         """Tell `audience` of all that is there, and of every change."""
         self._audiences.append(audience)
         if self.offered:
-            audience.services_changed(list(self.offered.values()), ())
+            if self._whole is None:
+                self._whole = _change(list(self.offered.values()), ())
+            audience.services_changed(self._whole)
 
     def remove(self, audience: ServiceCalls) -> None:
         """Tell it no more."""
@@ -82,6 +86,7 @@ class Services:
         """Nobody follows the graph any more: what there is will be found anew. Ids stay."""
         self._following.cancel()
         self.offered.clear()
+        self._whole = None
         self._providers.clear()
         self._retry_at_s.clear()
 
@@ -131,8 +136,21 @@ class Services:
             del self._providers[service.name]
         self.offered.update({service.name: service for service in added})
         if added or gone:
+            self._whole = None
+            change = _change(added, gone)
             for audience in list(self._audiences):
-                audience.services_changed(added, gone)
+                audience.services_changed(change)
+
+
+def _change(added: Sequence[OfferedService], removed: Sequence[OfferedService]) -> Change:
+    payloads = []
+    if removed:
+        payloads.append(messages.text({"op": "unadvertiseServices", "serviceIds": [each.id for each in removed]}))
+    if added:
+        payloads.append(
+            messages.text({"op": "advertiseServices", "services": [each.advertisement() for each in added]})
+        )
+    return Change(added, removed, payloads)
 
 
 def _look_up(master: Master, services: Sequence[str]) -> Dict[str, str]:
@@ -168,15 +186,13 @@ class ServiceCalls(Capability):
         protocol.register_operation(messages.SERVICE_CALL, self.call)
         protocol.server.services.add(self)
 
-    def services_changed(self, added: Sequence[OfferedService], removed: Sequence[OfferedService]) -> None:
-        """`removed` are gone, then `added` are there."""
-        if removed:
-            self.protocol.send({"op": "unadvertiseServices", "serviceIds": [service.id for service in removed]})
-        for service in removed:
+    def services_changed(self, change: Change) -> None:
+        """Take a change of the services."""
+        for payload in change.payloads:
+            self.protocol.send_payload(payload)
+        for service in change.removed:
             self._offered.pop(service.id, None)
-        self._offered.update({service.id: service for service in added})
-        if added:
-            self.protocol.send({"op": "advertiseServices", "services": [each.advertisement() for each in added]})
+        self._offered.update({service.id: service for service in change.added})
 
     def call(self, message: Operation) -> None:
         """Begin a call. It gets exactly one answer."""

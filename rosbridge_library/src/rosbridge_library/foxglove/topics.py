@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections import OrderedDict
 from typing import Any, Dict, List, NamedTuple, Optional, Sequence, Set
 
 from rosbridge_library.codec import MessageType, get_message_type
 from rosbridge_library.foxglove import messages
 from rosbridge_library.foxglove.latest import Latest
+from rosbridge_library.foxglove.offer import Change, Ids
 from rosbridge_library.foxglove.options import Options, matches
 from rosbridge_library.internal.exceptions import RosbridgeError
 from rosbridge_library.ros.feeds import Feed
@@ -27,8 +27,6 @@ logger = logging.getLogger("rosbridge.foxglove")
 PROBE_TIMEOUT_S = 2.0
 PROBES_AT_ONCE = 4
 RETRY_S = 5.0
-MAX_IDS = 10_000
-"""How many channels that are gone keep their id."""
 
 ANY_TYPE = "*"
 
@@ -48,31 +46,13 @@ class Channel(NamedTuple):
 class Audience:
     """Who is told of channels: each client."""
 
-    def channels_changed(self, added: Sequence[Channel], removed: Sequence[Channel]) -> None:
-        """`removed` are gone, then `added` are there."""
+    def channels_changed(self, change: Change) -> None:
+        """Take a change of the channels."""
         raise NotImplementedError
 
     def trouble_changed(self, topic: str, trouble: Optional[str]) -> None:
         """Why a topic has no channel; None when that is over."""
         raise NotImplementedError
-
-
-class Ids:
-    """Numbers for keys; the same key gets the same number again."""
-
-    def __init__(self) -> None:
-        self._ids: OrderedDict[Any, int] = OrderedDict()
-        self._last = 0
-
-    def of(self, key: Any) -> int:
-        """The number of `key`. Of those asked for long ago the oldest are forgotten, never to come back."""
-        if key not in self._ids:
-            self._last += 1
-            self._ids[key] = self._last
-            if len(self._ids) > MAX_IDS:
-                self._ids.popitem(last=False)
-        self._ids.move_to_end(key)
-        return self._ids[key]
 
 
 class Topics:
@@ -87,6 +67,7 @@ class Topics:
         self._options = options
         self._audiences: List[Audience] = []
         self._ids = Ids()
+        self._whole: Optional[Change] = None  # what a new client is told, if that is made already
         self._installed: Dict[str, Optional[MessageType]] = {}
         self._learnt: Dict[str, MessageType] = {}  # by topic, from publishers
         self._probes: Dict[str, asyncio.Task[None]] = {}
@@ -102,7 +83,9 @@ class Topics:
         """Tell `audience` of all that is there, if that is known yet, and of every change."""
         self._audiences.append(audience)
         if self.known:
-            audience.channels_changed(list(self.channels.values()), ())
+            if self._whole is None:
+                self._whole = _change(list(self.channels.values()), ())
+            audience.channels_changed(self._whole)
         for topic, trouble in self.troubles.items():
             audience.trouble_changed(topic, trouble)
 
@@ -123,6 +106,7 @@ class Topics:
         for probe in self._probes.values():
             probe.cancel()
         self.channels.clear()
+        self._whole = None
         self.troubles.clear()
         self._retry_at_s.clear()
         self._learnt.clear()
@@ -231,8 +215,19 @@ class Topics:
 
     def _tell(self, added: Sequence[Channel], removed: Sequence[Channel]) -> None:
         self.known = True
+        self._whole = None
+        change = _change(added, removed)
         for audience in list(self._audiences):
-            audience.channels_changed(added, removed)
+            audience.channels_changed(change)
+
+
+def _change(added: Sequence[Channel], removed: Sequence[Channel]) -> Change:
+    payloads = []
+    if removed:
+        payloads.append(messages.text({"op": "unadvertise", "channelIds": [channel.id for channel in removed]}))
+    if added or not removed:
+        payloads.append(messages.text({"op": "advertise", "channels": [each.advertisement() for each in added]}))
+    return Change(added, removed, payloads)
 
 
 def _load_installed(names: Sequence[str]) -> Dict[str, Optional[MessageType]]:
