@@ -90,6 +90,27 @@ def test_a_second_port(
     connect_foxglove(server).channel("/rosout")
 
 
+def test_a_second_port_that_is_held_does_not_hold_up_the_first(
+    start_bridge: Callable[..., Bridge], connect_foxglove: Callable[..., Foxglove]
+) -> None:
+    with socket.socket() as holder:
+        holder.bind(("127.0.0.1", 0))
+        holder.listen()
+        port = holder.getsockname()[1]
+        server = start_bridge({"foxglove_port": port, "retry_startup_delay": 0.1}, name="with_held_port")
+        connect_foxglove(server).channel("/rosout")
+        wait_until(lambda: "Unable to listen" in server.process.output, 5.0, "the warning")
+
+    def connects() -> bool:
+        try:
+            with Foxglove(f"ws://127.0.0.1:{port}") as client:
+                return client.channel("/rosout") is not None
+        except OSError:
+            return False
+
+    wait_until(connects, 10.0, "the second port")
+
+
 def test_the_server_can_offer_less(
     start_bridge: Callable[..., Bridge], connect_foxglove: Callable[..., Foxglove]
 ) -> None:

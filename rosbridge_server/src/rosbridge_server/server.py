@@ -78,6 +78,7 @@ class WebSocketServer:
         """The port in use, once `listen` is done."""
         self._handlers: Dict[str, ClientHandler] = {}
         self._accepted = 0
+        self._listening_too: Optional[asyncio.Future[None]] = None
         application = Application(
             [(r".*", ClientHandler, {"server": self})],
             websocket_ping_interval=settings.websocket_ping_interval,
@@ -92,17 +93,25 @@ class WebSocketServer:
         )
 
     async def listen(self) -> None:
-        """Listens on the address and port, and on foxglove_port if there is one; tries again every
-        ``retry_startup_delay`` while they are held.
+        """Listens on the address and port, and tries again every ``retry_startup_delay`` while they are held.
+
+        With foxglove_port, does the same for that one meanwhile.
 
         Raises ListenError when the reason won't go away by itself.
         """
         settings = self.settings
         sockets = await self._bind(settings.port)
         self.port = sockets[0].getsockname()[1]
-        if settings.foxglove_port and settings.foxglove_port != self.port:
-            sockets += await self._bind(settings.foxglove_port)
         self._http.add_sockets(sockets)
+        if settings.foxglove_port and settings.foxglove_port != self.port:
+            self._listening_too = asyncio.ensure_future(self._listen_too(settings.foxglove_port))
+
+    async def _listen_too(self, port: int) -> None:
+        """The second port: while another program holds it, clients of the first are served."""
+        try:
+            self._http.add_sockets(await self._bind(port))
+        except ListenError as error:
+            logger.error("%s", error)
 
     async def _bind(self, port: int) -> List[socket.socket]:
         settings = self.settings
@@ -130,6 +139,8 @@ class WebSocketServer:
 
     def close(self) -> None:
         """Stops listening, and ends every client: its protocol at once, its connection with a close frame."""
+        if self._listening_too is not None:
+            self._listening_too.cancel()
         self._http.stop()
         for handler in list(self._handlers.values()):
             handler.end(_GOING_AWAY, "the server is shutting down")
