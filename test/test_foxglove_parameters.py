@@ -279,6 +279,7 @@ def test_closed_parameters_look_as_if_they_were_not_set(
     assert ros_master.get_param("/limits/deep") == {"secret": 3, "opened": 4}
 
 
+@pytest.mark.allow_log("the ROS master at")
 def test_subscriptions_survive_a_master_that_restarts(
     ros_master: RosMaster, start_bridge: Callable[..., Bridge], connect_foxglove: Callable[..., Foxglove]
 ) -> None:

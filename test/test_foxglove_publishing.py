@@ -45,6 +45,7 @@ def test_fields_left_out_in_json_are_told_once_until_the_channel_is_gone(foxglov
     for _ in range(5):
         foxglove.publish(channel, b'{"linear": {"x": 3}}')
     assert peer.received(topic, 5)[-1]["linear"]["x"] == 3.0
+    foxglove.get_parameters("/rosdistro")  # all that was said before is there by now
     assert len(foxglove.statuses) == 1
     assert "angular" in foxglove.statuses[0]["message"]
     foxglove.send("unadvertise", channelIds=[channel])
@@ -132,6 +133,7 @@ def test_what_is_no_message_is_not_published_and_told_once(
         foxglove.publish(channel, data)
     foxglove.publish(channel, serialized(String("sound")) if encoding == "ros1" else b'{"data": "sound"}')
     assert [message["data"] for message in peer.received(topic, 1)] == ["sound"]
+    foxglove.get_parameters("/rosdistro")  # all that was said before is there by now
     assert [status["id"] for status in foxglove.statuses] == [f"publish:{channel}"]
     assert told.lower() in foxglove.statuses[0]["message"].lower()
     peer.command("unsubscribe", topic=topic)
