@@ -66,6 +66,9 @@ class FoxgloveProtocol(Protocol):
         if level in _LEVELS:
             self.send(messages.status(_LEVELS[level], message))
 
+    def dropped(self, messages: Mapping[str, int]) -> None:
+        """Nothing: channels tell of each topic by a status that is withdrawn when no more are dropped."""
+
     def show(self, status_id: str, message: str) -> None:
         """Show a warning until it is withdrawn, in place of the one with this id."""
         if self._shown.get(status_id) != message:
