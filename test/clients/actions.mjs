@@ -98,14 +98,28 @@ export async function watch(page, { server }) {
 export async function serve(page, { server }) {
   const ros = await page.connect();
   const actionServer = new page.roslib.SimpleActionServer({ ros, serverName: server, actionName: ACTION });
-  actionServer.on('goal', ({ goal }) => actionServer.sendFeedback({ feedback: goal * 10 }));
+  // ROS's client drops feedback that comes before it has noted down its own goal: told again until it is heard.
+  let current = null;
+  let telling = null;
+  const end = (how) => {
+    clearInterval(telling);
+    current = null;
+    how();
+  };
+  actionServer.on('goal', ({ goal }) => {
+    const tell = () => actionServer.sendFeedback({ feedback: goal * 10 });
+    current = goal;
+    telling = setInterval(tell, 100);
+    tell();
+  });
   // The robot tells that it has the feedback; a result that overtook it would make it void.
   const noted = new page.roslib.Topic({ ros, name: '/robot/goal_feedback', messageType: 'std_msgs/Int32' });
   noted.subscribe(({ data }) => {
-    if (data === 30) actionServer.setSucceeded({ result: 6 });
-    if (data === 40) actionServer.setAborted({ result: 0 });
+    if (current === null || data !== current * 10) return;
+    if (data === 30) end(() => actionServer.setSucceeded({ result: 6 }));
+    if (data === 40) end(() => actionServer.setAborted({ result: 0 }));
   });
-  actionServer.on('cancel', () => actionServer.setPreempted());
+  actionServer.on('cancel', () => end(() => actionServer.setPreempted()));
   const answerTo = `${server}/outcomes`;
   const ask = new page.roslib.Topic({ ros, name: '/robot/send_goals', messageType: 'std_msgs/String' });
   ask.publish(page.message({ data: JSON.stringify({ server, goals: [3, 4, 5], answer_to: answerTo }) }));
