@@ -19,6 +19,7 @@ import rosgraph.network
 
 from rosbridge_library.internal.exceptions import RosbridgeError
 from rosbridge_library.ros.network_errors import describe
+from rosbridge_library.ros.sockets import keep_alive
 from rosbridge_library.ros.tcpros_header import (
     LENGTH_BYTES,
     HeaderError,
@@ -29,9 +30,6 @@ from rosbridge_library.ros.tcpros_header import (
 
 URI_SCHEME = "rosrpc://"
 _CHUNK_BYTES = 256 * 1024
-
-# Detect a host that vanished while nobody has anything to say; the intervals are rospy's.
-_KEEPALIVE = (("TCP_KEEPIDLE", 60), ("TCP_KEEPINTVL", 10), ("TCP_KEEPCNT", 9))
 
 
 class ServiceError(RosbridgeError):
@@ -67,10 +65,7 @@ class ServiceConnection:
         self._buffer = bytearray()
         sock.setblocking(False)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        for option, value in _KEEPALIVE:
-            if hasattr(socket, option):
-                sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
+        keep_alive(sock)
 
     async def read(self, size: int) -> bytes:
         """Return the next `size` bytes. Memory grows with what came, not with `size`. Raises

@@ -36,6 +36,7 @@ from rospy.impl.transport import Transport
 
 from rosbridge_library.ros.master import NodeApi, NodeError, NodeUnreachable
 from rosbridge_library.ros.message import Wire
+from rosbridge_library.ros.sockets import keep_alive
 from rosbridge_library.ros.tcpros_header import LENGTH_BYTES, HeaderError, decode_header, decode_length, encode_header
 
 logger = logging.getLogger("rosbridge.tcpros")
@@ -288,7 +289,7 @@ class InboundConnection(_LoopTransport):
         """Raises OSError or HeaderError. On return the loop reads the socket."""
         sock = socket.socket(socket.AF_INET6 if use_ipv6() else socket.AF_INET, socket.SOCK_STREAM)
         sock.setblocking(False)
-        self._use_socket_keepalive(sock)
+        keep_alive(sock)
         try:
             await self._sock_connect(sock)
             await self.loop.sock_sendall(sock, encode_header(self.protocol.get_header_fields()))
@@ -317,14 +318,6 @@ class InboundConnection(_LoopTransport):
     async def _sock_connect(self, sock: socket.socket) -> None:
         infos = await self.loop.getaddrinfo(*self._address, family=sock.family, type=socket.SOCK_STREAM)
         await self.loop.sock_connect(sock, infos[0][4])
-
-    @staticmethod
-    def _use_socket_keepalive(sock: socket.socket) -> None:
-        """As rospy does, so that a publisher whose machine is gone is noticed."""
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        for option, value in (("TCP_KEEPCNT", 9), ("TCP_KEEPIDLE", 60), ("TCP_KEEPINTVL", 10)):
-            if hasattr(socket, option):
-                sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
 
     async def _read_header(self, sock: socket.socket) -> Tuple[bytes, bytes]:
         """The connection header, and what came behind it: at most READ_BYTES."""
