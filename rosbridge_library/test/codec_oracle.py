@@ -18,6 +18,10 @@ from typing import Any, Callable, Dict, Iterator, List, Tuple
 import cbor2
 import genpy
 import numpy as np
+import orjson
+import pytest
+
+from rosbridge_library.codec import MessageType, WireError
 
 INTEGERS = {
     "byte": (-128, 127),
@@ -264,3 +268,17 @@ def corruptions(wire: bytes, rng: random.Random, count: int) -> List[bytes]:
                 broken[at:at] = broken[at : at + rng.choice([1, 4, 8])]
         variants.append(bytes(broken))
     return variants
+
+
+def check_broken(message_type: MessageType, wire: bytes) -> None:
+    """The conversions of any bytes: right when they hold a message of the type, WireError when not."""
+    try:
+        expected = WireReader(wire).message(message_type.plan)
+    except Unreadable:
+        for convert in (message_type.to_values, message_type.to_json, message_type.to_cbor):
+            with pytest.raises(WireError):
+                convert(wire)
+        return
+    assert same(message_type.to_values(wire), expected)
+    orjson.loads(message_type.to_json(wire))
+    cbor2.loads(message_type.to_cbor(wire))

@@ -10,12 +10,11 @@ from typing import Any, Dict, List, NamedTuple, Tuple
 
 import cbor2
 import orjson
-import pytest
 from genpy.dynamic import generate_dynamic
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rosbridge_library.codec import MessageType, WireError, decode_cbor, message_type_from_definition
+from rosbridge_library.codec import MessageType, decode_cbor, message_type_from_definition
 
 sys.path.insert(0, str(Path(__file__).parent))
 import codec_oracle as oracle
@@ -140,18 +139,4 @@ def test_broken_bytes_are_refused_or_read_for_what_they_are(definition: Definiti
     cuts = range(len(wire)) if len(wire) < 100 else [rng.randrange(len(wire)) for _ in range(100)]
     broken = [wire[:cut] for cut in cuts] + [wire + b"\0", wire + wire] + oracle.corruptions(wire, rng, 25)
     for variant in broken:
-        check_broken(message_type, variant)
-
-
-def check_broken(message_type: MessageType, wire: bytes) -> None:
-    """The conversions of any bytes: right when they hold a message of the type, WireError when not."""
-    try:
-        expected = oracle.WireReader(wire).message(message_type.plan)
-    except oracle.Unreadable:
-        for convert in (message_type.to_values, message_type.to_json, message_type.to_cbor):
-            with pytest.raises(WireError):
-                convert(wire)
-        return
-    assert oracle.same(message_type.to_values(wire), expected)
-    orjson.loads(message_type.to_json(wire))
-    cbor2.loads(message_type.to_cbor(wire))
+        oracle.check_broken(message_type, variant)
