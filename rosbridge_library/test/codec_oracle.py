@@ -22,6 +22,7 @@ import orjson
 import pytest
 
 from rosbridge_library.codec import MessageType, WireError
+from rosbridge_library.codec.wire_walk import max_empty_elements
 
 INTEGERS = {
     "byte": (-128, 127),
@@ -221,6 +222,8 @@ class WireReader:
         count = self._number("I") if field.length is None else field.length
         if count * field.min_element_size > len(self._wire) - self._at:
             raise Unreadable("truncated")
+        if field.length is None and not field.min_element_size and count > max_empty_elements(field):
+            raise Unreadable("more than the codecs make of no bytes")
         if field.type in ("uint8", "char"):
             return self._bytes(count)
         return [self._element(field) for _ in range(count)]

@@ -187,13 +187,15 @@ HUGE: Dict[str, str] = {
     "fixed-size messages": "Point[] s",
     "messages": "Named[] s",
     "empty messages": "Empty[] s",
+    "messages of many empty ones": "Thousands[] s",
 }
 
 
 @pytest.mark.parametrize("field", HUGE.values(), ids=HUGE)
-@pytest.mark.parametrize("count", [2**32 - 1, 2**31, 10**6])
+@pytest.mark.parametrize("count", [2**32 - 1, 2**31, 10**6, 4096])
 def test_huge_counts_cost_nothing(field: str, count: int) -> None:
     parts = ["MSG: my_msgs/Point\nint8 x", "MSG: my_msgs/Named\nstring s", "MSG: my_msgs/Empty\n"]
+    parts += ["MSG: my_msgs/Tens\nEmpty[30] s", "MSG: my_msgs/Thousands\nTens[100] s"]
     message_type = message_type_from_definition("my_msgs/Huge", LINE.join([field, *parts]))
     raw = count.to_bytes(4, "little") + b"\0" * 40
     for convert in (message_type.to_values, message_type.to_json, message_type.to_cbor):

@@ -20,9 +20,10 @@ from ..internal.exceptions import WireError
 from .definition import CODE_SIZES, NUMBER_CODES, TIME_CODES, Field, Plan
 from .source import Source
 
-# Elements that take no bytes on the wire: no length of the wire bounds how many there may be.
-MAX_EMPTY_ELEMENTS = 4096
-
+# Elements that take no bytes on the wire: its length does not bound how many there may be. A few may always be, however
+# many empty messages each is made of; else all of them together are at most so many.
+FEW_ELEMENTS = 16
+MAX_EMPTY_MESSAGES = 4096
 
 # Remembered arrays are at most so long on the wire.
 MAX_REMEMBERED_BYTES = 4096
@@ -41,6 +42,12 @@ class Memory:
     def keep(self, count: int, raw: Union[bytes, memoryview], made: Any) -> None:
         if len(raw) <= MAX_REMEMBERED_BYTES:
             self.entry = (count, bytes(raw), made)
+
+
+def max_empty_elements(field: Field) -> int:
+    """How many elements that take no bytes on the wire an array may count."""
+    each = 1 + (field.message.values if field.message is not None else 0)
+    return max(FEW_ELEMENTS, MAX_EMPTY_MESSAGES // each)
 
 
 def is_memorable(field: Field) -> bool:
@@ -191,7 +198,7 @@ class WireWalk:
         if field.length is not None:
             return
         size = field.min_element_size
-        room = f"(end - ({self.position})) // {size}" if size else str(MAX_EMPTY_ELEMENTS)
+        room = f"(end - ({self.position})) // {size}" if size else str(max_empty_elements(field))
         with self.source.block(f"if {count} > {room}:"):
             self.source.line(f'raise ValueError("{field.name} counts %d elements" % {count})')
 
