@@ -8,6 +8,7 @@ one says so with `@pytest.mark.allow_log("pattern", …)`. The output of every p
 from __future__ import annotations
 
 import importlib
+import resource
 import sys
 from pathlib import Path
 from typing import Any, Callable, Iterator, List
@@ -16,6 +17,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent
 SHOWN_BYTES = 6000
+MAX_DATA_BYTES = 4 << 30
 
 
 def _make_importable() -> None:
@@ -43,6 +45,8 @@ from support.ros import RosMaster  # noqa: E402
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    # What runs away, here or in a process that a test starts, fails that test, and takes no machine down.
+    resource.setrlimit(resource.RLIMIT_DATA, (MAX_DATA_BYTES, resource.getrlimit(resource.RLIMIT_DATA)[1]))
     config.addinivalue_line("markers", "alone: measures delays, which other tests at the same time would add to")
     config.addinivalue_line(
         "markers", "allow_log(*patterns): regular expressions of errors that the server may log in this test"
