@@ -12,8 +12,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosapi.params import MAX_DEPTH, ParameterError, Params, from_json, to_json
+from rosapi.params import Params, from_json, to_json
 from rosbridge_library.access import Access
+from rosbridge_library.parameter_values import MAX_DEPTH, ParameterError
 
 Call = Callable[..., Any]
 
@@ -56,6 +57,8 @@ class TestJson:
             (datetime.datetime(2020, 2, 29, 12, 30, 5), '"2020-02-29T12:30:05"'),
             ({1: {None: True}}, '{"1": {"None": true}}'),
             (2**40, "1099511627776"),
+            (2**64, "1.8446744073709552e+19"),
+            (10**400, "null"),
             ((1, 2), "[1, 2]"),
             ("é\n", '"\\u00e9\\n"'),
         ],

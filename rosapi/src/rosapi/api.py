@@ -16,11 +16,11 @@ from rosapi.graph import Graph, action_servers, fetch_graph, names_with
 from rosapi.params import Params
 from rosapi.recent import Recent
 from rosapi.service_types import Probe, ServiceTypes
-from rosapi.xml_text import is_xml_text
 from rosbridge_library.access import Access
 from rosbridge_library.internal.exceptions import TypeLoadError
 from rosbridge_library.names import global_name
 from rosbridge_library.ros.master import MasterError
+from rosbridge_library.xml_text import is_xml_text
 
 MAX_AGE_S = 1.0
 """How old the master's state may be that an answer comes from."""

@@ -1,59 +1,25 @@
 # SPDX-License-Identifier: BSD-3-Clause
 """The parameter server for web clients: values as JSON text, names as global names, within `params_glob`.
 
-Between JSON and the parameter server lies XML-RPC, which carries neither null nor integers beyond 32 bits,
-and which can hold binary data and dates, that JSON can't. What can't be carried is refused, with the reason;
-a value read is always turned into JSON.
-
 A parameter that the globs close looks as if it didn't exist, and can't be set or deleted; nor can a namespace
 that holds one, and reading a namespace leaves it out.
 """
 
 from __future__ import annotations
 
-import base64
-import datetime
 import json
-import math
-import xmlrpc.client
 from typing import Any, Callable, Iterable, Iterator, List, Optional
 
-from rosapi.xml_text import is_xml_text
 from rosbridge_library.access import Access
-from rosbridge_library.internal.exceptions import RosbridgeError
 from rosbridge_library.names import global_name
+from rosbridge_library.parameter_values import ParameterError, check, jsonable, too_deep
 from rosbridge_library.ros.master import MasterError
-
-INT_LIMITS = (xmlrpc.client.MININT, xmlrpc.client.MAXINT)
-
-# Deeper than any real parameter, and far below what makes the master fail when it writes the value out.
-MAX_DEPTH = 64
-
-
-class ParameterError(RosbridgeError):
-    """A parameter is not read or changed as asked; the text says why."""
+from rosbridge_library.xml_text import is_xml_text
 
 
 def to_json(value: Any) -> str:
-    """A value from the parameter server as JSON text.
-
-    NaN and infinities are null, binary data (bytes) is base64, a date (datetime) is ISO 8601 text, keys are text.
-    """
-    return json.dumps(_jsonable(value), allow_nan=False)
-
-
-def _jsonable(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(key): _jsonable(each) for key, each in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_jsonable(each) for each in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, bytes):
-        return base64.b64encode(value).decode("ascii")
-    if isinstance(value, datetime.datetime):
-        return value.isoformat()
-    return value
+    """A value from the parameter server as JSON text; see `jsonable`."""
+    return json.dumps(jsonable(value), allow_nan=False)
 
 
 def from_json(text: str) -> Any:
@@ -64,44 +30,13 @@ def from_json(text: str) -> Any:
     try:
         value = json.loads(text)
     except RecursionError:
-        raise _too_deep() from None
+        raise too_deep() from None
     except ValueError as error:
         raise ParameterError(
             f"the value must be JSON ({error}); a string takes quotes, as in {json.dumps(text[:40])}"
         ) from error
-    _check(value, "", 0)
+    check(value)
     return value
-
-
-def _check(value: Any, where: str, depth: int) -> None:
-    """ParameterError when the parameter server can't hold `value`, which is at `where` in the whole."""
-    if depth > MAX_DEPTH:
-        raise _too_deep()
-    if isinstance(value, dict):
-        for key, each in value.items():
-            _check(key, f"{where} (key)", depth)
-            _check(each, f"{where}.{key}" if where else key, depth + 1)
-    elif isinstance(value, list):
-        for index, each in enumerate(value):
-            _check(each, f"{where}[{index}]", depth + 1)
-    elif value is None:
-        raise ParameterError(f"the parameter server can't hold null{_at(where)}")
-    elif isinstance(value, int) and not INT_LIMITS[0] <= value <= INT_LIMITS[1]:
-        raise ParameterError(f"the parameter server holds integers of 32 bits only, not {_shown(value)}{_at(where)}")
-    elif isinstance(value, str) and not is_xml_text(value):
-        raise ParameterError(f"the parameter server can't hold control characters or half a surrogate pair{_at(where)}")
-
-
-def _shown(value: int) -> str:
-    return str(value) if value.bit_length() <= 128 else f"one of {value.bit_length()} bits"
-
-
-def _too_deep() -> ParameterError:
-    return ParameterError(f"the value is nested deeper than {MAX_DEPTH} levels")
-
-
-def _at(where: str) -> str:
-    return f" at {where[:200]!a}" if where else ""
 
 
 class Params:

@@ -2,22 +2,18 @@
 """Parameter values between the protocol's JSON and the parameter server's XML-RPC: pure functions.
 
 JSON has one kind of number and no binary data, so the protocol has a `type` beside the value: float64, float64_array
-or byte_array (base64). XML-RPC has floats, integers of 32 bits, binary data and dates; a date becomes ISO 8601 text,
-and what is no number becomes null. Neither has a value for "not set": that is an entry without one.
+or byte_array (base64). It has no value for "not set": that is an entry without one.
 """
 
 from __future__ import annotations
 
 import base64
 import binascii
-import datetime
 import math
 from typing import Any, Callable, Dict, Iterator, List, Mapping, Optional, Tuple
 
 from rosbridge_library.internal.exceptions import InvalidArgumentException
-
-MAX_DEPTH = 64
-"""Deeper than any real parameter, and far below what makes the master fail when it writes the value out."""
+from rosbridge_library.parameter_values import check, jsonable
 
 ABSENT: Any = object()
 """The value of a parameter that is not set."""
@@ -27,7 +23,7 @@ def entry(name: str, value: Any) -> Dict[str, Any]:
     """The entry of a parameterValues message for a value of the parameter server, or for ABSENT."""
     if value is ABSENT:
         return {"name": name}
-    told = {"name": name, "value": _to_json(value)}
+    told = {"name": name, "value": jsonable(value)}
     type_ = _type(value)
     return told if type_ is None else {**told, "type": type_}
 
@@ -43,32 +39,17 @@ def _type(value: Any) -> Optional[str]:
     return None
 
 
-def _to_json(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(key): _to_json(each) for key, each in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_to_json(each) for each in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, bytes):
-        return base64.b64encode(value).decode("ascii")
-    if isinstance(value, datetime.datetime):
-        return value.isoformat()
-    if isinstance(value, int) and not -(1 << 63) <= value < 1 << 64:
-        return float(value) if abs(value) < 1 << 1000 else None  # beyond what the JSON writer has
-    return value
-
-
 def from_entry(parameter: Mapping[str, Any]) -> Any:
     """The value for the parameter server of an entry of setParameters, or ABSENT to unset it.
 
-    Raises InvalidArgumentException.
+    Raises InvalidArgumentException and ParameterError.
     """
     value, type_ = parameter.get("value"), parameter.get("type")
     if value is None:
         return ABSENT
     if type_ is None:
-        _check(value, 0)
+        check(value)
+        _check_keys(value)
         return value
     convert = _TYPES.get(type_) if isinstance(type_, str) else None
     if convert is None:
@@ -101,19 +82,15 @@ def _floats(value: Any) -> List[float]:
 _TYPES: Dict[str, Callable[[Any], Any]] = {"byte_array": _bytes, "float64": _float, "float64_array": _floats}
 
 
-def _check(value: Any, depth: int) -> None:
-    if depth > MAX_DEPTH:
-        raise InvalidArgumentException(f"the value is nested deeper than {MAX_DEPTH} levels")
+def _check_keys(value: Any) -> None:
     if isinstance(value, dict):
         if not all(value) or any("/" in key for key in value):
             raise InvalidArgumentException("a map's keys are names of parameters: not empty, and without slashes")
         for each in value.values():
-            _check(each, depth + 1)
+            _check_keys(each)
     elif isinstance(value, list):
         for each in value:
-            _check(each, depth + 1)
-    elif value is None:
-        raise InvalidArgumentException("the parameter server can't hold null inside a value")
+            _check_keys(each)
 
 
 def leaves(name: str, value: Any) -> Iterator[Tuple[str, Any]]:
