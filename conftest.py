@@ -36,6 +36,7 @@ _make_importable()
 
 from support import bridge as bridges  # noqa: E402
 from support import process as processes  # noqa: E402
+from support import robot as robots  # noqa: E402
 from support.bridge import Bridge  # noqa: E402
 from support.client import Client  # noqa: E402
 from support.foxglove import Foxglove  # noqa: E402
@@ -137,6 +138,13 @@ def peer(ros_master: RosMaster) -> Iterator[Peer]:
     node = Peer(ros_master)
     yield node
     node.node.stop()
+
+
+@pytest.fixture(scope="module")
+def robot(ros_master: RosMaster) -> Iterator[Node]:
+    """The node that the published clients are tried with."""
+    with robots.start(ros_master) as node:
+        yield node
 
 
 @pytest.fixture

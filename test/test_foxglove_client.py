@@ -17,7 +17,6 @@ from typing import Any, Callable, Iterator
 import genpy
 import pytest
 
-from support import robot as robots
 from support.bridge import Bridge
 from support.node import Node
 from support.peer import Peer
@@ -26,12 +25,6 @@ from support.ros import RosMaster
 
 PROGRAM = Path(__file__).resolve().parent / "clients" / "foxglove.mjs"
 TOPICS = [f"/robot/sample/{name}" for name in SAMPLES]
-
-
-@pytest.fixture(scope="module")
-def robot(ros_master: RosMaster) -> Iterator[Node]:
-    with robots.start(ros_master) as node:
-        yield node
 
 
 @pytest.fixture(params=["foxglove.websocket.v1", "foxglove.sdk.v1"])

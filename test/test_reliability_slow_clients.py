@@ -8,9 +8,7 @@ tests take longer and hold stricter figures.
 from __future__ import annotations
 
 import contextlib
-import json
 import socket
-import struct
 import threading
 import time
 from typing import Callable, Dict, Iterator, List
@@ -22,6 +20,7 @@ from support.effort import LONG, effort, figure
 from support.link import Link
 from support.node import Node
 from support.peer import Peer
+from support.programs.websocket import connect, text_frame
 from support.ros import RosMaster
 from support.usage import Peak, usage
 from support.viewer import Viewer, sensors, subscription
@@ -39,19 +38,9 @@ Start = Callable[..., Bridge]
 
 def deaf_client(port: int, *subscriptions: Dict[str, str]) -> socket.socket:
     """A client that subscribes and then reads nothing by itself; its kernel takes little."""
-    connection = socket.socket()
-    connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    connection.connect(("127.0.0.1", port))
-    connection.sendall(
-        b"GET / HTTP/1.1\r\nHost: robot\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-        b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
-    )
-    answer = b""
-    while not answer.endswith(b"\r\n\r\n"):
-        answer += connection.recv(1)
+    connection = connect(port, receive_buffer=4096)
     for wanted in subscriptions:
-        body = json.dumps({"op": "subscribe", **wanted}).encode()
-        connection.sendall(struct.pack("!BBH", 0x81, 0xFE, len(body)) + bytes(4) + body)
+        connection.sendall(text_frame({"op": "subscribe", **wanted}))
     return connection
 
 

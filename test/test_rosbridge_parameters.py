@@ -25,13 +25,6 @@ def fresh(name: str = "topic") -> str:
     return f"/{name}_{next(_numbers)}"
 
 
-@pytest.fixture(scope="module")
-def peer(ros_master: RosMaster) -> Iterator[Peer]:
-    node = Peer(ros_master)
-    yield node
-    node.node.stop()
-
-
 def live(client: Client, topic: str, kind: Any = None, **options: Any) -> str:
     client.set_level("info")
     number = client.subscribe(topic, kind, **options)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import base64
 import itertools
 import time
-from typing import Any, Dict, Iterator, List
+from typing import Any, Dict, List
 
 import pytest
 
@@ -23,13 +23,6 @@ ADD, EMPTY = "rosbridge_library/AddTwoInts", "std_srvs/Empty"
 
 def fresh(name: str = "service") -> str:
     return f"/{name}_{next(_numbers)}"
-
-
-@pytest.fixture(scope="module")
-def peer(ros_master: RosMaster) -> Iterator[Peer]:
-    node = Peer(ros_master)
-    yield node
-    node.node.stop()
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,6 @@ from typing import Any, Dict, Iterator, List
 import pytest
 from tf2_msgs.msg import TFMessage
 
-from support import robot as robots
 from support.bridge import Bridge
 from support.node import Node, publish, script
 from support.robot import SAMPLES, as_json, heard, wire
@@ -75,12 +74,6 @@ def result(program: Node) -> Any:
 def bridge(ros_master: RosMaster) -> Iterator[Bridge]:
     with Bridge(ros_master, {"unregister_timeout": 0.5}, rosapi=True) as server:
         yield server
-
-
-@pytest.fixture(scope="module")
-def robot(ros_master: RosMaster) -> Iterator[Node]:
-    with robots.start(ros_master) as node:
-        yield node
 
 
 @pytest.fixture(params=[1, 2], ids=["1.x", "2.x"])

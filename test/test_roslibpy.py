@@ -19,7 +19,6 @@ import genpy
 import pytest
 import roslibpy
 
-from support import robot as robots
 from support.bridge import Bridge
 from support.node import Node, publish, script
 from support.robot import SAMPLES, as_json, heard
@@ -42,12 +41,6 @@ Open = Callable[..., roslibpy.Ros]
 def bridge(ros_master: RosMaster) -> Iterator[Bridge]:
     with Bridge(ros_master, {"unregister_timeout": 0.5}, rosapi=True) as server:
         yield server
-
-
-@pytest.fixture(scope="module")
-def robot(ros_master: RosMaster) -> Iterator[Node]:
-    with robots.start(ros_master) as node:
-        yield node
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import random
 import signal
 import socket
@@ -16,7 +15,7 @@ import time
 import urllib.error
 import urllib.request
 from pathlib import Path
-from typing import Any, Callable, Dict, Iterator, List
+from typing import Any, Callable, Iterator, List
 
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
@@ -27,6 +26,8 @@ from support.client import Client, defragment
 from support.node import Node, echo, serve
 from support.peer import Peer
 from support.process import Process
+from support.programs.websocket import connect as plain_websocket
+from support.programs.websocket import text_frame
 from support.ros import RosMaster, executable, free_port
 from support.wait import wait_until
 
@@ -50,32 +51,6 @@ def run(ros_master: RosMaster) -> Iterator[Callable[..., Process]]:
     yield start
     for process in processes:
         process.stop()
-
-
-@pytest.fixture(scope="module")
-def peer(ros_master: RosMaster) -> Iterator[Peer]:
-    found = Peer(ros_master)
-    yield found
-    found.node.stop()
-
-
-def plain_socket(bridge: Bridge) -> socket.socket:
-    """A websocket connection that does nothing by itself: it answers no ping and reads nothing."""
-    connection = socket.create_connection(("127.0.0.1", bridge.port), 10)
-    connection.sendall(
-        b"GET / HTTP/1.1\r\nHost: robot\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-        b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
-    )
-    answer = b""
-    while not answer.endswith(b"\r\n\r\n"):
-        answer += connection.recv(1)
-    assert b" 101 " in answer
-    return connection
-
-
-def text_frame(operation: Dict[str, Any]) -> bytes:
-    body = json.dumps(operation).encode()
-    return struct.pack("!BBQ", 0x81, 0xFF, len(body)) + bytes(4) + body
 
 
 def own_topics(namespace: str) -> List[str]:
@@ -305,7 +280,7 @@ def test_ping_parameters_close_a_half_open_client_and_count_it_no_more(
         arguments=own_topics("/pinging"),
     )
     counts = nodes(echo(ros_master, "/pinging/client_count", "std_msgs/Int32"))
-    half_open = plain_socket(bridge)
+    half_open = plain_websocket(bridge.port)
     half_open.sendall(text_frame({"op": "advertise", "topic": "/half_open", "type": STRING}))
     wait_until(lambda: {"data": 1} in counts.records("message"))
     bridge.process.wait_for_line("is closed: nothing came from it for 0.5 s after a ping", 5.0)
@@ -327,7 +302,7 @@ def test_bytes_that_are_no_http_and_no_websocket_harm_nobody(bridge: Bridge, con
             with contextlib.suppress(ConnectionError):
                 while connection.recv(65536):
                     pass
-        with plain_socket(bridge) as connection, contextlib.suppress(ConnectionError):
+        with plain_websocket(bridge.port) as connection, contextlib.suppress(ConnectionError):
             connection.sendall(bytes(noise.choices(range(256), k=size)))
     client.sync()
 
@@ -345,7 +320,7 @@ def test_more_clients_than_the_soft_limit_on_open_files(ros_master: RosMaster) -
 
 def test_invalid_utf8_is_an_error_status_and_the_connection_goes_on(bridge: Bridge, connect: Connect) -> None:
     client = connect(bridge)
-    half_open = plain_socket(bridge)
+    half_open = plain_websocket(bridge.port)
     half_open.sendall(struct.pack("!BB", 0x81, 0x83) + bytes(4) + b'{"\xff'[:3])
     half_open.sendall(text_frame({"op": "nonsense", "id": "after"}))
     half_open.settimeout(10)
@@ -394,7 +369,7 @@ def test_the_count_is_right_after_a_connect_storm(
 
     def storm() -> None:
         for number in range(100):
-            connection = plain_socket(bridge)
+            connection = plain_websocket(bridge.port)
             if number % 10 == 0:
                 stay.append(connection)
             else:
@@ -433,7 +408,7 @@ def test_a_signal_ends_it_within_three_seconds_whatever_clients_do(
         well = stack.enter_context(bridge.connect())
         well.subscribe("/flood", STRING)
         for _ in range(5):  # these subscribe and then read nothing
-            stalled = stack.enter_context(contextlib.closing(plain_socket(bridge)))
+            stalled = stack.enter_context(contextlib.closing(plain_websocket(bridge.port)))
             stalled.sendall(text_frame({"op": "subscribe", "topic": "/flood", "type": STRING, "queue_length": 100}))
         hanging = stack.enter_context(contextlib.closing(socket.create_connection(("127.0.0.1", bridge.port))))
         hanging.sendall(b"GET / HTTP/1.1\r\nHost: never finishes its header")

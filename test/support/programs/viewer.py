@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 import re
 import selectors
-import socket
 import struct
 import time
 from typing import Any, Dict, List, Tuple
@@ -19,8 +18,8 @@ from typing import Any, Dict, List, Tuple
 import cbor2
 
 from programs.program import options, ready, say
+from programs.websocket import CLOSE, PING, PONG, TEXT, connect, frame
 
-TEXT, CLOSE, PING, PONG = 1, 8, 9, 10
 _TOPIC = re.compile(rb'\\?"topic\\?":\\?"([^"\\]+)')
 _STAMP = re.compile(rb'\\?"secs\\?":(\d+),\\?"nsecs\\?":(\d+)')
 _FRAGMENT = re.compile(rb'"num":(\d+),"total":(\d+)}$')
@@ -35,26 +34,13 @@ class Connection:
     """One websocket client."""
 
     def __init__(self, port: int, receive_buffer: int) -> None:
-        self.socket = socket.socket()
-        if receive_buffer:
-            self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer)
-        self.socket.connect(("127.0.0.1", port))
-        self.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self.socket.sendall(
-            b"GET / HTTP/1.1\r\nHost: robot\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-            b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
-        )
-        answer = b""
-        while not answer.endswith(b"\r\n\r\n"):
-            answer += self.socket.recv(1)
+        self.socket = connect(port, receive_buffer=receive_buffer)
         self.warnings: List[str] = []
         self._data = bytearray()
         self._begun: Dict[bytes, Tuple[str, float]] = {}  # fragment id: topic and stamp
 
     def send(self, opcode: int, body: bytes) -> None:
-        size = len(body)
-        head = struct.pack("!BB", 0x80 | opcode, 0x80 | size) if size < 126 else b""
-        self.socket.sendall((head or struct.pack("!BBH", 0x80 | opcode, 0xFE, size)) + bytes(4) + body)
+        self.socket.sendall(frame(opcode, body))
 
     def read(self, seen: Reading) -> bool:
         """Notes what has come; False when the server closed the connection."""
