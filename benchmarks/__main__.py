@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Dict, Iterator, List, Optional, Sequence, Tuple
 
 from benchmarks import report
-from benchmarks.cases import Case, all_cases, matching, quick_cases
+from benchmarks.cases import Case, all_cases, matching, quick_cases, usual_cases
 from benchmarks.measure import machine
 from benchmarks.runner import QUICK, Durations, Runner, run_all
 from benchmarks.server import Candidate, candidate, started_environment
@@ -32,7 +32,8 @@ def main(arguments: Optional[Sequence[str]] = None) -> int:
     """Runs it; the exit code is 1 when a case failed."""
     parser = _parser()
     options = parser.parse_args(arguments)
-    cases = matching(quick_cases() if options.quick else all_cases(), options.only)
+    cases = quick_cases() if options.quick else all_cases() if options.all else usual_cases()
+    cases = matching(cases, options.only)
     with_codecs = not options.only or any(fnmatch.fnmatch(CODECS, pattern) for pattern in options.only)
     if options.list:
         print("\n".join([*(case.name for case in cases), *([CODECS] if with_codecs else [])]))
@@ -124,6 +125,7 @@ def _allow_many_connections() -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="scripts/bench", description="What a bridge costs; see benchmarks/README.md.")
     parser.add_argument("--quick", action="store_true", help="a few short cases: does it work? (never: how fast?)")
+    parser.add_argument("--all", action="store_true", help="every load in every encoding, with 1, 10 and 100 clients")
     parser.add_argument(
         "--server",
         action="append",

@@ -35,9 +35,20 @@ class Case(NamedTuple):
         return f"{self.load}/{self.encoding}/{self.clients}"
 
 
-def all_cases() -> List[Case]:
-    """Every case of a full run, in its order."""
+def usual_cases() -> List[Case]:
+    """The cases of a run that names none, in their order: those that tell something which the others don't."""
     return [*_topic_cases(), *_other_cases(idle_clients=1000)]
+
+
+def all_cases() -> List[Case]:
+    """Every load in every encoding, with each number of clients, and what is not about topics."""
+    topics = [
+        _topic(load, encoding, clients)
+        for load in LOADS
+        for clients in (1, 10, MANY_CLIENTS)
+        for encoding in (*_SUBSCRIBED, "png")
+    ]
+    return [*topics, *_other_cases(idle_clients=1000)]
 
 
 def quick_cases() -> List[Case]:

@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from benchmarks import report  # noqa: E402
-from benchmarks.cases import all_cases, matching  # noqa: E402
+from benchmarks.cases import all_cases, matching, usual_cases  # noqa: E402
 from benchmarks.messages import LOADS, Template, message_class  # noqa: E402
 from benchmarks.stamps import HEAD_BYTES, NO_STAMP, finder  # noqa: E402
 from benchmarks.tally import Tally, Window, percentile_ms  # noqa: E402
@@ -110,6 +110,7 @@ def test_server_that_runs_already(ros_master: RosMaster, bridge: Bridge, tmp_pat
 def test_case_names_choose():
     cases = all_cases()
     assert len({case.name for case in cases}) == len(cases)
+    assert set(usual_cases()) < set(cases)
     assert [case.name for case in matching(cases, ["image/cbor-raw/1*"])] == [
         f"image/cbor-raw/{clients}" for clients in (1, 10, 100)
     ]
