@@ -1,15 +1,19 @@
 # SPDX-License-Identifier: BSD-3-Clause
-"""The graph watch: one question for all, and none without listeners."""
+"""The graph: read anew only when it has changed, watched by one question for all, and none without listeners."""
 
 from __future__ import annotations
 
 import asyncio
-from typing import List, Optional
+import gc
+from typing import Any, Dict, List, Optional
 
 import pytest
 
 from rosbridge_library.internal.exceptions import RosbridgeError
-from rosbridge_library.ros.graph import Graph, GraphWatch, TopicInfo
+from rosbridge_library.ros.graph import Graph, GraphReader, GraphWatch, TopicInfo
+from rosbridge_library.ros.master import Master, MasterUnreachable
+from rosbridge_library.ros.node import Node
+from support.ros import RosMaster, free_port
 
 GRAPH = Graph({"/a": ["/n"]}, {"/a": ["/m"], "/b": ["/m"]}, {}, {"/a": "std_msgs/String", "/b": "*", "/gone": "x/Y"})
 
@@ -18,6 +22,48 @@ def test_what_there_is_of_a_topic() -> None:
     assert GRAPH.topic("/a") == TopicInfo("std_msgs/String", ["/n"], ["/m"])
     assert GRAPH.topic("/b") == TopicInfo("", [], ["/m"])
     assert GRAPH.topic("/gone") == TopicInfo("", [], [])
+
+
+def test_a_graph_that_has_not_changed_is_the_same(ros_master: RosMaster) -> None:
+    master = Master("/reader", ros_master.uri)
+    reader = GraphReader(master)
+    empty = reader.ask()
+    assert reader.ask() is empty
+    assert empty.topic("/read") == TopicInfo("", [], [])
+    uri = "http://127.0.0.1:1/"
+    master.call("registerPublisher", "/read", "std_msgs/String", uri)
+    published = reader.ask()
+    assert published.topic("/read") == TopicInfo("std_msgs/String", ["/reader"], [])
+    assert reader.ask() is published
+    master.call("registerPublisher", "/read", "std_msgs/Int32", uri)  # the same node, with another type
+    assert reader.ask().topic("/read").type == "std_msgs/Int32"
+    master.call("unregisterPublisher", "/read", uri)
+    assert reader.ask().topic("/read") == TopicInfo("", [], [])
+
+
+def test_nothing_is_logged_of_a_failure_that_nobody_waits_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_MASTER_URI", f"http://127.0.0.1:{free_port()}/")
+    told: List[Dict[str, Any]] = []
+
+    async def run() -> None:
+        loop = asyncio.get_running_loop()
+        loop.set_exception_handler(lambda _, context: told.append(context))
+        node = Node(loop)
+        askers = [loop.create_task(node.topic("/topic")) for _ in range(2)]
+        await asyncio.sleep(0)
+        askers[0].cancel()  # the client has left
+        with pytest.raises(MasterUnreachable):
+            await askers[1]
+        asker = loop.create_task(node.topic("/topic"))
+        await asyncio.sleep(0)
+        asker.cancel()
+        lookups = asyncio.all_tasks() - {asyncio.current_task()}
+        await asyncio.wait(lookups)
+        assert len(lookups) == 2  # the asker, and what it asked
+
+    asyncio.run(run())
+    gc.collect()
+    assert told == []
 
 
 def test_all_listeners_are_told_by_one_question_and_nothing_is_asked_without_any() -> None:

@@ -46,10 +46,27 @@ class Graph(NamedTuple):
         return TopicInfo("" if type_ == "*" else type_, publishers, subscribers)
 
 
-def ask_graph(master: Master) -> Graph:
-    """Ask the master, blocking. Raises MasterUnreachable or MasterError."""
-    publishers, subscribers, services = map(_users, master.call("getSystemState"))
-    return Graph(publishers, subscribers, services, dict(master.call("getTopicTypes")))
+class GraphReader:
+    """Asks the master for the graph, from any thread.
+
+    As long as nothing has changed it returns the same Graph: with a thousand topics, reading the master's XML takes 20
+    ms in which no other thread of the process gets on, the graph is looked at every second, and it hardly ever changes.
+    """
+
+    def __init__(self, master: Master) -> None:
+        self._master = master
+        self._last: Optional[Tuple[Tuple[bytes, bytes], Graph]] = None  # replaced as a whole: threads need no lock
+
+    def ask(self) -> Graph:
+        """Ask, blocking. Raises MasterUnreachable or MasterError."""
+        answers = self._master.answer("getSystemState"), self._master.answer("getTopicTypes")
+        last = self._last
+        if last is not None and last[0] == answers:
+            return last[1]
+        publishers, subscribers, services = map(_users, self._master.value("getSystemState", answers[0]))
+        graph = Graph(publishers, subscribers, services, dict(self._master.value("getTopicTypes", answers[1])))
+        self._last = answers, graph
+        return graph
 
 
 def _users(entries: List[Tuple[str, List[str]]]) -> Dict[str, List[str]]:

@@ -10,7 +10,6 @@ it). The calls block: on the event loop they belong on the thread pool.
 from __future__ import annotations
 
 import http.client
-import re
 import socket
 import time
 import urllib.parse
@@ -22,9 +21,7 @@ import rosgraph
 
 from rosbridge_library.internal.exceptions import RosbridgeError
 from rosbridge_library.ros.network_errors import describe
-
-# What XML 1.0 has no character for (section 2.2). The master answers it with an HTTP error, as if it were broken.
-_NOT_XML = re.compile("[^\t\n\r\u0020-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+from rosbridge_library.xml_text import is_xml_text
 
 # The state of a graph of ten thousand topics is about 2 MB; what is far longer is no answer.
 MAX_ANSWER_BYTES = 64 * 1024 * 1024
@@ -74,6 +71,13 @@ class NodeApi:
         Raises NodeUnreachable or NodeError (of Master: MasterUnreachable, MasterError), and
         UnsupportedValue for arguments that XML-RPC can't carry.
         """
+        return self.value(method, self.answer(method, *args, timeout=timeout))
+
+    def answer(self, method: str, *args: Any, timeout: Optional[float] = None) -> bytes:
+        """The bytes of the answer to a `call`, for `value`: a caller may know already what they say.
+
+        Raises what `call` raises, but NodeError.
+        """
         body = _encode_call(method, (self.caller_id, *args))
         seconds = self.timeout if timeout is None else timeout
         try:
@@ -84,9 +88,10 @@ class NodeApi:
             raise self._unreachable(describe(error)) from error
         if status != http.client.OK:
             raise self._unreachable(f"it answered {method} with HTTP status {status}")
-        return self._value(method, answer)
+        return answer
 
-    def _value(self, method: str, answer: bytes) -> Any:
+    def value(self, method: str, answer: bytes) -> Any:
+        """The value in the bytes that `answer` returned for that method. Raises NodeUnreachable or NodeError."""
         try:
             parameters, _ = xmlrpc.client.loads(answer, use_builtin_types=True)
             code, message, value = cast(Tuple[Any, ...], parameters[0])
@@ -176,7 +181,7 @@ def _post(uri: str, body: bytes, deadline: float) -> Tuple[int, bytes]:
 def _encode_call(method: str, args: Tuple[Any, ...]) -> bytes:
     try:
         text = xmlrpc.client.dumps(args, method)
-        if _NOT_XML.search(text):
+        if not is_xml_text(text):
             raise UnsupportedValue(f"the arguments of {method} have control characters, which XML-RPC can't carry")
         return text.encode("utf-8")
     except (TypeError, OverflowError, UnicodeError, RecursionError) as error:

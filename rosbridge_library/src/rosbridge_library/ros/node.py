@@ -27,7 +27,7 @@ from rosbridge_library.access import Access
 from rosbridge_library.internal.exceptions import RosbridgeError
 from rosbridge_library.ros.accepting import relieve_accept_thread
 from rosbridge_library.ros.feeds import Feeds
-from rosbridge_library.ros.graph import Graph, GraphWatch, TopicInfo, ask_graph
+from rosbridge_library.ros.graph import Graph, GraphReader, GraphWatch, TopicInfo
 from rosbridge_library.ros.master import Master, MasterUnreachable
 from rosbridge_library.ros.param_watch import ParamWatch
 from rosbridge_library.ros.providers import ServiceProviders
@@ -89,6 +89,7 @@ class Node:
         self.publishers = Publishers(loop, self._handler, unregister_timeout_s)
         self.services = ServiceCaller(self.call, self.master, self.caller_id)
         self.providers = ServiceProviders(self.call, self.master, self.caller_id)
+        self._graph_reader = GraphReader(self.master)
         self.graph_watch = GraphWatch(self._ask_graph)
         self.param_watch = ParamWatch(loop, self.master, self._registrar, self.call)
         self._topic_lookup: Optional[asyncio.Task[Graph]] = None
@@ -177,6 +178,7 @@ class Node:
         lookup = self._topic_lookup
         if lookup is None:
             lookup = self._topic_lookup = self.loop.create_task(self._look_up_topics())
+            lookup.add_done_callback(_know_outcome)
         graph = await asyncio.shield(lookup)
         return graph.topic(topic)
 
@@ -187,9 +189,15 @@ class Node:
 
     async def _ask_graph(self) -> Graph:
         time_s = self.loop.time()
-        graph = await self.call(ask_graph, self.master, timeout=2 * MASTER_TIMEOUT_S + 1)
+        graph = await self.call(self._graph_reader.ask, timeout=2 * MASTER_TIMEOUT_S + 1)
         self._graph, self._graph_time_s = graph, time_s
         return graph
+
+
+def _know_outcome(lookup: asyncio.Task[Graph]) -> None:
+    """Whoever asked may be gone by now; then a failure concerns nobody."""
+    if not lookup.cancelled():
+        lookup.exception()
 
 
 class _Background:
