@@ -122,7 +122,7 @@ def test_without_an_id_setting_has_no_answer(foxglove: Foxglove, ros_master: Ros
         ({"name": "", "value": 5}, "not a legal name"),
         ({"name": "/", "value": {}}, "not a legal name"),
         ({"name": "/not legal", "value": 5}, "not a legal name"),
-        ({"name": "/bad", "value": 2**31}, "can't be sent over XML-RPC"),
+        ({"name": "/bad", "value": 2**31}, "integers of 32 bits only"),
         ({"name": "/bad", "value": [1, None]}, "can't hold null"),
         ({"name": "/bad", "value": {"a": None}}, "can't hold null"),
         ({"name": "/bad", "value": {"a/b": 1}}, "keys"),

@@ -69,6 +69,7 @@ class ConnectionGraph:
     def __init__(self, sees_topic: Callable[[str], bool], sees_service: Callable[[str], bool]) -> None:
         self._sees_topic = sees_topic
         self._sees_service = sees_service
+        self._graph: Optional[Graph] = None
         self._connections: Optional[Connections] = None
         self._told: Dict[ConnectionGraphUpdates, Optional[Connections]] = {}
 
@@ -86,13 +87,14 @@ class ConnectionGraph:
 
     def follow(self, graph: Optional[Graph]) -> None:
         """Tell all what has changed; without a graph, what there is stays."""
-        if graph is not None:
+        if graph is not None and graph is not self._graph:
+            self._graph = graph
             self._connections = Connections.of(graph, self._sees_topic, self._sees_service)
             self._tell()
 
     def forget(self) -> None:
         """Nobody follows the graph any more."""
-        self._connections = None
+        self._graph = self._connections = None
 
     def _tell(self) -> None:
         now = self._connections

@@ -59,6 +59,7 @@ class Services:
         self._providers: Dict[str, List[str]] = {}  # those that the type of an offered service was learnt from
         self._told: Dict[str, Tuple[str, str]] = {}  # service: uri, and the type that it told
         self._retry_at_s: Dict[str, float] = {}
+        self._settled: Optional[Graph] = None  # the graph of which every service is offered
         self._following: Latest[Graph] = Latest(self._follow)
 
     def may_see(self, service: str) -> bool:
@@ -89,8 +90,11 @@ class Services:
         self._whole = None
         self._providers.clear()
         self._retry_at_s.clear()
+        self._settled = None
 
     async def _follow(self, graph: Graph) -> None:
+        if graph is self._settled:
+            return
         provided = {name: nodes for name, nodes in graph.services.items() if nodes and self.may_see(name)}
         gone = [service for name, service in self.offered.items() if provided.get(name) != self._providers.get(name)]
         self._change([], gone)
@@ -104,6 +108,7 @@ class Services:
         )
         for start in range(0, len(unknown), PROBED_AT_ONCE):
             await self._learn(unknown[start : start + PROBED_AT_ONCE], provided)
+        self._settled = graph if len(self.offered) == len(provided) else None
 
     async def _learn(self, names: Sequence[str], provided: Dict[str, List[str]]) -> None:
         uris = await self._node.call(_look_up, self._node.master, names)

@@ -73,6 +73,7 @@ class Topics:
         self._probes: Dict[str, asyncio.Task[None]] = {}
         self._probe_slots = asyncio.Semaphore(PROBES_AT_ONCE)
         self._retry_at_s: Dict[str, float] = {}
+        self._settled: Optional[Graph] = None  # the graph of which every topic has its channel
         self._following: Latest[Graph] = Latest(self._follow)
 
     def may_see(self, topic: str) -> bool:
@@ -110,6 +111,7 @@ class Topics:
         self.troubles.clear()
         self._retry_at_s.clear()
         self._learnt.clear()
+        self._settled = None
         self.known = False
 
     def correct(self, channel: Channel, feed: Feed, found: MessageType) -> bool:
@@ -123,6 +125,8 @@ class Topics:
         return True
 
     async def _follow(self, graph: Graph) -> None:
+        if graph is self._settled:
+            return
         published = {
             topic: graph.types.get(topic, ANY_TYPE)
             for topic, nodes in graph.publishers.items()
@@ -139,6 +143,7 @@ class Topics:
                 self._learn(topic, graph.publishers[topic])
         gone = [channel for topic, channel in self.channels.items() if topic not in types]
         self._replace(types, gone)
+        self._settled = graph if len(types) == len(published) else None
 
     def _forget_all_but(self, published: Dict[str, str]) -> None:
         for topic in [topic for topic in self._learnt if topic not in published]:
