@@ -184,7 +184,7 @@ class Runner:
         result: Result = {"seconds": seconds}
         if server.pids:
             others_s = machine_end - machine_begin - cpu_s - (ours_end.cpu_s - ours_begin.cpu_s)
-            result["cpu_s"] = round(cpu_s, 2)  # /proc counts hundredths
+            result["cpu_s"] = round(cpu_s, 6)
             result["cpu_percent"] = round(100 * cpu_s / seconds, 1)
             result["rss_mb"] = round(server_end.rss_bytes / 1e6, 1)
             result["other_cpu_percent"] = round(max(0.0, 100 * others_s / seconds), 1)

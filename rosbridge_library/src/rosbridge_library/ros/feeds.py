@@ -24,6 +24,7 @@ from rospy.topics import _SubscriberImpl, _TopicImpl
 from rosbridge_library.codec import MessageType, message_type_from_definition
 from rosbridge_library.internal.exceptions import RosbridgeError
 from rosbridge_library.ros.message import Message, Wire
+from rosbridge_library.ros.outcome import know_outcome
 from rosbridge_library.ros.tcpros import InboundConnection, LoopTcprosHandler, NoPoller, Receiver
 
 if TYPE_CHECKING:
@@ -106,6 +107,7 @@ class Feed(Receiver):
         """
         if self._live is None or self._live.cancelled() or (self._live.done() and self._live.exception()):
             self._live = self._feeds.loop.create_task(self._become_live())
+            self._live.add_done_callback(know_outcome)
         await asyncio.shield(self._live)
 
     async def _become_live(self) -> None:

@@ -29,6 +29,7 @@ from rosbridge_library.ros.accepting import relieve_accept_thread
 from rosbridge_library.ros.feeds import Feeds
 from rosbridge_library.ros.graph import Graph, GraphReader, GraphWatch, TopicInfo
 from rosbridge_library.ros.master import Master, MasterUnreachable
+from rosbridge_library.ros.outcome import know_outcome
 from rosbridge_library.ros.param_watch import ParamWatch
 from rosbridge_library.ros.providers import ServiceProviders
 from rosbridge_library.ros.publishers import Publishers
@@ -178,7 +179,7 @@ class Node:
         lookup = self._topic_lookup
         if lookup is None:
             lookup = self._topic_lookup = self.loop.create_task(self._look_up_topics())
-            lookup.add_done_callback(_know_outcome)
+            lookup.add_done_callback(know_outcome)
         graph = await asyncio.shield(lookup)
         return graph.topic(topic)
 
@@ -192,12 +193,6 @@ class Node:
         graph = await self.call(self._graph_reader.ask, timeout=2 * MASTER_TIMEOUT_S + 1)
         self._graph, self._graph_time_s = graph, time_s
         return graph
-
-
-def _know_outcome(lookup: asyncio.Task[Graph]) -> None:
-    """Whoever asked may be gone by now; then a failure concerns nobody."""
-    if not lookup.cancelled():
-        lookup.exception()
 
 
 class _Background:
