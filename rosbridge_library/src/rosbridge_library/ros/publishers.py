@@ -2,7 +2,7 @@
 """What the bridge publishes for its clients: one publisher per topic, shared by all who advertise it.
 
 A publisher outlives the last client that advertised it by `unregister_timeout_s`, so that a page that is refreshed
-finds it registered and connected, and loses nothing.
+finds it registered and connected, and loses nothing; and for as long as it keeps messages for others, see below.
 
 ROS connects publishers and subscribers behind the back of both: a subscriber that was there before is told by the
 master, asks where to connect, and connects, all after `advertise` has returned. So a new publisher notes which
@@ -29,6 +29,8 @@ logger = logging.getLogger("rosbridge.publishers")
 
 WARM_UP_S = 5.0
 DEFAULT_QUEUE_SIZE = 100
+KEEPING_INTERVAL_S = 0.1
+"""How often at the most it is looked whether a publisher without clients still keeps messages."""
 
 _UINT32 = struct.Struct("<I")
 
@@ -85,6 +87,11 @@ class Publisher:
         """Nobody else will connect that was there before this publisher."""
         self._expected.clear()
         self._missed.clear()
+
+    @property
+    def keeps_messages(self) -> bool:
+        """Whether there are messages for nodes that have not connected yet."""
+        return bool(self._missed)
 
     def attach(self, connection: OutboundConnection) -> None:
         """A subscriber has connected: it gets what it has missed or, of a latched topic, the last message."""
@@ -161,7 +168,14 @@ class Publishers:
         """`user` publishes no more. After the last one the publisher lingers for `unregister_timeout_s`."""
         publisher.users.discard(user)
         if not publisher.users and publisher.lingering is None and self._publishers.get(publisher.topic) is publisher:
-            publisher.lingering = self._loop.call_later(self._unregister_timeout_s, self._close, publisher)
+            publisher.lingering = self._loop.call_later(self._unregister_timeout_s, self._expire, publisher)
+
+    def _expire(self, publisher: Publisher) -> None:
+        if publisher.keeps_messages:
+            wait_s = max(self._unregister_timeout_s, KEEPING_INTERVAL_S)
+            publisher.lingering = self._loop.call_later(wait_s, self._expire, publisher)
+        else:
+            self._close(publisher)
 
     def _close(self, publisher: Publisher) -> None:
         if publisher.lingering is not None:
