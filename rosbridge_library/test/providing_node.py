@@ -8,7 +8,6 @@ that reaches a provider as a line of JSON on its output.
 from __future__ import annotations
 
 import asyncio
-import functools
 import json
 import os
 import sys
@@ -22,6 +21,7 @@ import rospy
 from rosbridge_library.codec import MessageType, get_service_type
 from rosbridge_library.internal.exceptions import RosbridgeError
 from rosbridge_library.ros.master import Master
+from rosbridge_library.ros.node import call_blocking
 from rosbridge_library.ros.providers import Provider, ServiceProviders
 
 Command = Dict[str, Any]
@@ -40,8 +40,7 @@ class ProvidingNode:
         self._cancelled = 0
 
     async def _call_blocking(self, function: Callable[..., Any], *args: Any, timeout: Optional[float] = 5.0) -> Any:
-        work = asyncio.get_running_loop().run_in_executor(self._threads, functools.partial(function, *args))
-        return await asyncio.wait_for(work, timeout)
+        return await call_blocking(self._threads, function, args, timeout)
 
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         command = json.loads(await reader.readline())

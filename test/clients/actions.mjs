@@ -85,11 +85,12 @@ export async function watch(page, { server }) {
     4,
     () => new page.roslib.ActionListener({ ros: other, serverName: server, actionName: ACTION }),
   );
-  listener.on('goal', (message) => seen.goals.push(message.goal.goal));
+  const goal = once(listener, 'goal');
   listener.on('feedback', (message) => seen.feedback.push(message.feedback));
   const result = once(listener, 'result');
   const { outcome } = send(page, client(page, ros, server), 3);
   seen.results.push((await result).result);
+  seen.goals.push((await goal).goal.goal); // no order among topics: it may come last
   await outcome;
   return seen;
 }
