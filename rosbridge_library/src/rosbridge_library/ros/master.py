@@ -25,6 +25,7 @@ from rosbridge_library.xml_text import is_xml_text
 
 # The state of a graph of ten thousand topics is about 2 MB; what is far longer is no answer.
 MAX_ANSWER_BYTES = 64 * 1024 * 1024
+READ_BYTES = 1 << 16
 
 
 class NodeUnreachable(RosbridgeError):
@@ -170,10 +171,14 @@ def _post(uri: str, body: bytes, deadline: float) -> Tuple[int, bytes]:
         headers = {"Content-Type": "text/xml", "Connection": "close"}
         connection.request("POST", parts.path or "/", body, headers)
         response = connection.getresponse()
-        answer = response.read(MAX_ANSWER_BYTES + 1)
-        if len(answer) > MAX_ANSWER_BYTES:
-            raise ValueError(f"its answer is longer than {MAX_ANSWER_BYTES} bytes")
-        return response.status, answer
+        answer = bytearray()
+        while True:
+            piece = response.read(READ_BYTES)  # piece by piece: Python 3.8 first clears as much memory as may be read
+            if not piece:
+                return response.status, bytes(answer)
+            answer += piece
+            if len(answer) > MAX_ANSWER_BYTES:
+                raise ValueError(f"its answer is longer than {MAX_ANSWER_BYTES} bytes")
     finally:
         connection.close()
 
