@@ -86,11 +86,17 @@ export async function watch(page, { server }) {
     () => new page.roslib.ActionListener({ ros: other, serverName: server, actionName: ACTION }),
   );
   const goal = once(listener, 'goal');
-  listener.on('feedback', (message) => seen.feedback.push(message.feedback));
+  const told = new Promise((resolve) => {
+    listener.on('feedback', ({ feedback }) => {
+      seen.feedback.push(feedback);
+      if (feedback === 3) resolve();
+    });
+  });
   const result = once(listener, 'result');
   const { outcome } = send(page, client(page, ros, server), 3);
   seen.results.push((await result).result);
-  seen.goals.push((await goal).goal.goal); // no order among topics: it may come last
+  seen.goals.push((await goal).goal.goal); // there is no order among topics: this may come last, or the feedback
+  await told;
   await outcome;
   return seen;
 }
