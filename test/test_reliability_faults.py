@@ -11,7 +11,7 @@ import signal
 import socket
 import threading
 import time
-from typing import Any, Callable, Dict, Iterator, List
+from typing import Any, Callable, Dict, List
 
 import pytest
 
@@ -33,13 +33,6 @@ Nodes = Callable[[Node], Node]
 Start = Callable[..., Bridge]
 
 _numbers = itertools.count(1)
-
-
-@pytest.fixture(scope="module")
-def peer(ros_master: RosMaster) -> Iterator[Peer]:
-    found = Peer(ros_master)
-    yield found
-    found.node.stop()
 
 
 def fresh(name: str) -> str:
